@@ -1,4 +1,6 @@
-"""Outputs of all commands: kept without --force, whole or as they were on a full disk, and paths that are no files.
+"""Outputs of all commands: kept without --force, whole or as they were on a full disk, no files, and their names.
+
+Names in files of strangers never lead out of the folder that a command writes to.
 
 A limit on the size of files stands for a full disk. `make nightly` also mounts small file systems in memory, whose free
 pages and number of files are counted over all files together, so that a limit meets each write of a command in turn,
@@ -13,14 +15,26 @@ import shutil
 import stat
 import subprocess
 import threading
+from dataclasses import replace
 from pathlib import Path
 
-import pandas as pd
+import numpy as np
 import pytest
-from helpers import assert_refused, content_of, files_up_to, make_once
-from small_sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
+import worlds
+from helpers import assert_refused, content_of, files_up_to
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from small_sweeps import grid_file, small_sequence, stamps
 
-from psotrack.show.flights import find_recording
+from psotrack.errors import InputError
+from psotrack.foreground.detection import LabelSettings, write_data_set
+from psotrack.foreground.silhouettes import masks_out
+from psotrack.live import recording_folder
+from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.exchange import Footage, export_tracks
+from psotrack.show.flights import TrackedFlight
+from psotrack.show.overlay import write_overlays
+from psotrack.support import check_file_name
 
 #: What is there before -> words of the command that would replace it.
 OUTPUTS = {
@@ -28,7 +42,6 @@ OUTPUTS = {
     "lens.toml": "calibrate rig {flight}/c0.avi --squares 7x5 --square 0.04 --out lens.toml",
     "lens.png": "calibrate rig {flight}/c0.avi --squares 7x5 --square 0.04 --out x.toml --plot lens.png",
     "recording.toml": "init {flight} --out recording.toml",
-    "draft.json": "init {flight} --out x.toml --json draft.json",
     "info.json": "init --show {flight} --json info.json",
     "tracks.csv": "track {flight} --out tracks.csv",
     "tracks.json": "track {flight} --out tracks.csv",
@@ -38,7 +51,6 @@ OUTPUTS = {
     "live.csv": "live {flight} --replay --out live.csv",
     "live.toml": "live {flight} --replay --out x.csv --save-config live.toml",
     "filmed/mine": "live {flight} --replay --lines --record filmed",
-    "errors.json": "evaluate {tracks} {flight} --json errors.json",
     "errors.png": "evaluate {tracks} {flight} --json x.json --plot errors.png",
     "export.csv": "export {tracks} --to csv --out export.csv",
     "tum/mine": "export {tracks} --to tum --out tum",
@@ -47,11 +59,9 @@ OUTPUTS = {
     "videos/c1.mp4": "overlay {tracks} {flight} --out videos",
     "flight.psotrack": "archive {tracks} {flight} --out flight.psotrack",
     "unpacked/mine": "archive {data}/version_1.psotrack --out unpacked",
-    "doctor.json": "doctor {flight} --tracks {tracks} --json doctor.json",
     "masks.mp4": "detect {flight} --cameras c0 --masks masks.mp4",
     "masks/c1/mine": "detect {flight} --masks masks",
     "boxes/c1.csv": "detect {flight} --blobs --out boxes",
-    "silhouettes.json": "detect --silhouettes {flight} --json silhouettes.json",
     "yolo/mine": "simulate labels {flight} {second} --drone-size 0.3,0.3,0.15 --out yolo",
     "data/Simulated_Data/S01_D2_A/mine": "simulate S01_D2_A --out data",
     "sticks.csv": "simulate fly --device keyboard --out sticks.csv",
@@ -96,7 +106,6 @@ def test_nothing_is_overwritten_without_force(run_psotrack, world, place, name):
 #: Name of the output -> words of a command, one for each library that writes files.
 FILES = {
     "rig.toml": "calibrate convert {flight}/rig.toml rig.toml",
-    "recording.toml": "init {flight} --out recording.toml --quiet",
     "errors.png": "evaluate {tracks} {flight} --plot errors.png --quiet",
     "export.parquet": "export {tracks} --to parquet --out export.parquet",
     "export.c3d": "export {tracks} --to c3d --out export.c3d",
@@ -132,8 +141,6 @@ def test_a_file_is_whole_or_as_it_was(run_psotrack, world, place, name):
         Path(name).write_bytes(OLDER)
         with files_up_to(limit):
             result = run_psotrack(*words)
-        # `init` keeps the older file under another name.
-        Path(f"{name}.bak").unlink(missing_ok=True)
         assert content_of(place) == {name: OLDER}, limit
         assert_refused(lambda result=result: result, name, unchanged=place)
     assert run_psotrack(*words).code == 0
@@ -260,6 +267,82 @@ def test_a_dash_makes_no_file_of_this_name(run_psotrack, world, place, words):
     assert_refused(lambda: run_psotrack(*words_of(words, world)), unchanged=place.parent)
 
 
+# --- names in files of strangers
+
+#: Names that lead elsewhere, that are no names of files, or that are too long.
+EVIL = [
+    *("../evil", "../../x", "/tmp/evil", "a/b", "..", ".", "", "a\0b", "a\nb", "C:evil", "..\\evil"),
+    *(" a", "a ", "...", "a*", "a?b", '"', "a|b", "ä" * 100, "a" * 300),
+]
+
+
+@pytest.mark.parametrize("name", EVIL)
+def test_a_name_that_is_none_of_a_file(name, tmp_path):
+    """A drone is read from a file of tracks, and is a file of the export."""
+    refusal = "here: expected names that can be names of files"
+    assert_refused(lambda: check_file_name(name, "here"), refusal, unchanged=tmp_path)
+    tracks = replace(worlds.make_tracks(), drones=(name, "b"))
+    for to in ("tum", "kitti"):
+        assert_refused(lambda to=to: export_tracks(tracks, to, tmp_path / "out"), unchanged=tmp_path)
+
+
+@pytest.mark.parametrize("name", ["0", "cam1i_s", "dron1", "GoPro 3.left", "ä", "a" * 180, ".hidden", "a..b"])
+def test_a_name_that_is_one(name):
+    assert check_file_name(name, "here") == name
+
+
+@given(st.text(max_size=40))
+def test_a_name_that_is_taken_stays_in_its_folder(name):
+    folder = Path("/data/out")
+    try:
+        path = folder / f"{check_file_name(name, 'here')}.csv"
+    except InputError:
+        assume(False)
+    assert path.parent == folder
+    assert path.resolve().parent == folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "detect {lab} --masks {out}",
+        "detect {lab} --blobs --out {out}",
+        "overlay {tracks} {lab} --out {out}",
+        "export {tracks} {lab} --to mot --drone-size 0.3,0.3,0.1 --out {out}",
+        "simulate labels {lab} {other} --drone-size 0.3,0.3,0.1 --out {out}",
+        "live {lab} --replay --lines --record {out}",
+        "track {lab} --out {out}.csv",
+    ],
+)
+def test_commands_that_name_files_like_cameras(words, world, tmp_path, run_psotrack):
+    lab = shutil.copytree(world / "flight", tmp_path / "lab")
+    for file in (lab / "recording.toml", lab / "rig.toml"):
+        file.write_text(file.read_text().replace("[cameras.c0]", '[cameras."../evil"]'))
+    places = {"lab": lab, "other": world / "second", "tracks": world / "tracks.csv"}
+    words = words.format(**places, out=tmp_path / "in" / "out").split()
+    assert_refused(lambda: run_psotrack(*words), lab, "../evil", unchanged=tmp_path)
+
+
+def test_names_of_cameras_that_python_built(flight, tmp_path):
+    """Files have names that are checked; Python may build a recording with any."""
+    recording = open_recording(flight)
+    first, *others = recording.cameras
+    recording = replace(recording, cameras=(replace(first, name="../evil"), *others))
+    out = tmp_path / "in" / "out"
+    other, footage = replace(recording, name="other"), Footage(recording, np.full((2, 3), 0.3))
+    labels = LabelSettings((0.3, 0.3, 0.1))
+    for write in (
+        lambda: write_overlays(out, TrackedFlight("flight", (), recording)),
+        lambda: masks_out(out, ("a", "../evil")),
+        lambda: write_data_set([recording, other], out, labels),
+        lambda: export_tracks(worlds.make_tracks(), "mot", out, footage=footage),
+        lambda: recording_folder(out, recording, recording.rig.names).__enter__(),
+    ):
+        with pytest.raises(InputError, match=r"found '(flight[-_])?\.\./evil'"):
+            write()
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 # --- small disks
 
 PAGE_BYTES = 4096
@@ -324,18 +407,6 @@ def root(tmp_path_factory):
     return small_sequence(tmp_path_factory)
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory, root):
-    """Inputs of the commands, which no test changes."""
-
-    def make(folder):
-        done = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
-        assert done.returncode == 0, done.stderr
-        grid_file(folder, [2, 3]).rename(folder / "grid.toml")
-
-    return make_once(tmp_path_factory, "inputs_of_small_disks", make)
-
-
 def contents(folder: Path) -> dict[str, bytes | None]:
     """Path of every file, hidden ones included, -> bytes without times; of a folder -> None."""
     return {name: content and TIMES.sub(rb"\1\2", content) for name, content in content_of(folder).items()}
@@ -364,20 +435,19 @@ TRACK = (
 #: Outputs, which belong together -> words of the command that replaces them.
 TOGETHER = {
     "tracks.csv tracks.ambiguity.csv tracks.json": f"{TRACK} --out tracks.csv",
-    "tracks.parquet tracks.ambiguity.csv tracks.json": f"{TRACK} --out tracks.parquet",
-    "videos.psotrack": "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos "
-    "--out videos.psotrack --force",
-    "markers.csv": "onboard detect {flight}/c0.avi --frames 4 --out markers.csv --force --quiet",
+    "videos.psotrack": "archive {made} {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
 }
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("outputs", TOGETHER)
 def test_outputs_of_one_run_are_whole_or_as_they_were(
-    run_psotrack, disk, root, inputs, flight, outputs, monkeypatch
+    run_psotrack, disk, root, outputs, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
-    words, names = TOGETHER[outputs].format(root=root, inputs=inputs, flight=flight).split(), outputs.split()
+    made, names = tmp_path / "made.csv", outputs.split()
+    assert run_psotrack(*TRACK.format(root=root).split(), "--out", made).code == 0
+    words = TOGETHER[outputs].format(root=root, made=made).split()
     assert run_psotrack(*words).code == 0
     whole = contents(disk.place)
     older = dict.fromkeys(names, OLDER)
@@ -399,13 +469,17 @@ GO_ON = {
     "data": "simulate S01_D2_A --out data --frames 3 --scale 0.1 --jobs 1 --no-onboard --quiet",
     "cache": "detect --silhouettes {flight} --cache cache --jobs 1 --quiet",
     "videos": "overlay {tracks} {flight} --out videos --jobs 1 --quiet",
+    # Found: the next call refused the sequence that the first one had simulated.
+    "demo": "demo --out demo --jobs 1 --quiet",
 }
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", GO_ON)
-def test_the_next_run_goes_on(run_psotrack, disk, world, name):
+def test_the_next_run_goes_on(run_psotrack, disk, world, name, monkeypatch):
     """The disk grows from call to call, and is never emptied."""
+    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
     words = words_of(GO_ON[name], world)
     assert run_psotrack(*words).code == 0
     whole, tries = contents(disk.place), rooms(disk.taken(), 4)
@@ -425,60 +499,23 @@ def test_the_next_run_goes_on(run_psotrack, disk, world, name):
 
 
 @pytest.mark.nightly
-def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
+def test_a_sweep_goes_on(run_psotrack, disk, root, tmp_path, monkeypatch):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
-    words = ["sweep", inputs / "grid.toml", "--data", root, "--quiet", "--out"]
-    assert run_psotrack(*words, "whole").code == 0
+    words = ["sweep", grid_file(tmp_path, [2, 3]), "--data", root, "--quiet", "--out", "results"]
     # Until the disk takes the first cell.
     tries = [*(("files", n) for n in range(4)), *(("pages", n) for n in range(0, 100, 3))]
     while not stamps(Path("results")):
         kind, more = tries.pop(0)
         with disk.room_for(**{kind: disk.taken()[kind] + more}):
-            result = run_psotrack(*words, "results")
+            result = run_psotrack(*words)
         assert_says(result, "results")
         assert not [path for path in contents(disk.place) if ".partial" in path], (kind, more)
         # No cell has failed: the disk has.
         assert not list(disk.place.glob("results/cells/*.error.json")), (kind, more)
     finished = stamps(Path("results"))
     assert len(finished) == 1
-    assert run_psotrack(*words, "results").code == 0
+    assert run_psotrack(*words).code == 0
     assert finished.items() < stamps(Path("results")).items(), "a finished cell is not run again"
-    expected, found = (
-        all_rows(Path(name)).set_index("settings.swarm.iterations").sort_index().filter(regex="error")
-        for name in ("whole", "results")
-    )
-    assert len(expected.columns) > 0
-    pd.testing.assert_frame_equal(found, expected)
-
-
-@pytest.mark.nightly
-def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch):
-    """Found: after a full disk, the next call refused the sequence that the first one had simulated."""
-    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
-    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
-    words = ["demo", "--out", "demo", "--jobs", "1", "--quiet"]
-    assert run_psotrack(*words).code == 0
-
-    def simulated():
-        return {path: path.stat().st_mtime_ns for path in Path("demo/Simulated_Data").rglob("*")}
-
-    whole, made = contents(disk.place), simulated()
-    results = [
-        Path("demo", name) for name in ("tracks.csv", "tracks.json", "tracks.ambiguity.csv", "demo.png")
-    ]
-    # Found: the demo wrote no record, so that `psotrack view demo/tracks.csv` had no cameras.
-    assert find_recording(results[0]).resolve() == Path("demo/Simulated_Data/S02_D4_A").resolve()
-    for pages in (0, 2, results[0].stat().st_size // PAGE_BYTES + 2):
-        for path in results:
-            path.unlink(missing_ok=True)
-        with disk.room_for(pages=disk.taken()["pages"] + pages):
-            result = run_psotrack(*words)
-        assert (result.code, result.err.count("\n")) == (2, 1), (pages, result)
-        assert not any(path.exists() for path in results), pages
-        assert ".partial" not in "".join(contents(disk.place)), pages
-    assert run_psotrack(*words).code == 0
-    assert contents(disk.place) == whole
-    assert simulated() == made
 
 
 #: More commands that write: what is on the disk that cannot be written is at `out`.

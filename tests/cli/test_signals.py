@@ -1,6 +1,6 @@
 """Ctrl-C and SIGTERM: each command ends with one line, a code that shells know, and nothing left.
 
-Each test waits for an event: a line of the program, a file, or the end of a process.
+The tests wait for events: a line of the program, a file, or the end of a process.
 """
 
 import os
@@ -32,41 +32,22 @@ main()
 """
 #: A command that is in a long computation, which is not Python's, while it writes a file.
 IN_A_LONG_COMPUTATION = """
-import signal, sys, threading, time
+import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 import psotrack.__main__
 import psotrack.cli
 
-begun = threading.Event()
-
-def begin(x):
-    begun.set()
-    return x
-
-def is_in_python(frame):
-    return frame is not None and ("callback" in frame.f_code.co_name or is_in_python(frame.f_back))
-
-def say():
-    # The computation has begun, and the main thread is no longer in its callback.
-    begun.wait()
-    while is_in_python(sys._current_frames()[threading.main_thread().ident]):
-        time.sleep(0.01)
-    print("computes", flush=True)
-
 def run(started):
     import jax
-    import jax.numpy as jnp
     from psotrack.support import atomic_write
 
-    def compute(x):
-        # Minutes of work in one call.
-        x = jax.pure_callback(begin, jax.ShapeDtypeStruct((), jnp.float32), x)
-        return jax.lax.fori_loop(0, 2 * 10**9, lambda i, x: x * 1.0001, x)
-
-    threading.Thread(target=say, daemon=True).start()
+    compute = jax.jit(lambda count: jax.lax.fori_loop(0, count, lambda i, x: x * 1.0001, 1.0))
+    compute(1)
     with atomic_write(sys.argv[1]) as temporary:
         temporary.write_text("half")
-        jax.jit(compute)(jnp.float32(1.0)).block_until_ready()
+        print("computes", flush=True)
+        # Minutes of work in one call.
+        compute(2 * 10**9).block_until_ready()
 
 psotrack.cli.main = run
 psotrack.__main__.main()
@@ -185,21 +166,22 @@ def test_a_command_at_work_ends_with_one_line(start_track, tmp_path, number):
     assert_unchanged(tmp_path)
 
 
-@each_signal
-def test_a_computation_that_answers_no_signal_is_ended(start_python, tmp_path, number):
+def test_a_computation_that_answers_no_signal_is_ended(start_python, tmp_path):
     process = start_python("-c", IN_A_LONG_COMPUTATION, tmp_path / "out.txt")
     assert process.stdout.readline() == "computes\n"
-    assert_ends(process, number)
+    # A signal before the call is answered by Python: this is many times what comes between the line and the call.
+    time.sleep(0.2)
+    assert_ends(process, signal.SIGINT)
     assert list(tmp_path.iterdir()) == []
 
 
-@each_signal
-def test_workers_end_without_a_word(start_python, tmp_path, number):
+@pytest.mark.slow
+def test_workers_end_without_a_word(start_python, tmp_path):
     """Found: warnings of zarr, in workers that were ended while they made an array."""
     (tmp_path / "noisy.py").write_text(WITH_NOISY_WORKERS)
     process = start_python(tmp_path / "noisy.py")
     assert [process.stdout.readline() for _ in range(2)] == ["works\n"] * 2
-    assert_ends(process, number)
+    assert_ends(process, signal.SIGTERM)
 
 
 def test_ctrl_c_in_a_callback_of_the_garbage_collector_ends_the_command(start_python, tmp_path):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import re
 import shutil
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -16,14 +13,13 @@ import pytest
 from helpers import assert_refused, cameras_of, files_up_to, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
-from network_cameras import MJPEG, NetworkCamera, jpeg_part, timed, wait_for_lines
+from small_sweeps import wait_until
 
 from psotrack.live import (
     CameraRecorder,
     CameraStream,
     Instant,
     Meeting,
-    SourceFrame,
     StreamClock,
     live_cameras,
     recording_folder,
@@ -33,12 +29,12 @@ from psotrack.recordings.datasets import open_recording
 
 FPS = 25.0
 WAIT_S = 0.1
-#: Size of the images of streams, and of those that are recorded.
-SMALL_WH, SIZE_WH = (64, 48), (320, 240)
+#: Size of the images that are recorded.
+SIZE_WH = (320, 240)
 RIG = ring_rig(3, image_size_wh=SIZE_WH)
 
 
-# --- streams
+# --- times
 
 
 def clock_times(stream_s: np.ndarray, arrived_s: np.ndarray) -> tuple[np.ndarray, list[bool | None]]:
@@ -88,76 +84,6 @@ def test_a_frame_that_the_stream_does_not_count_is_noticed() -> None:
     wrong = np.abs(times_s - arrived_s) > 1e-6
     assert wrong.sum() <= 2 * 2 * FPS
     assert not wrong[-1]
-
-
-@pytest.fixture
-def taken() -> Iterator[Callable[..., tuple[list[SourceFrame], list[float], list[str]]]]:
-    """Gives the frames of a stream until it breaks off, their ages when they are taken, and what is said."""
-    cameras = []
-
-    def take(parts, at_s, work_s=0.0, kind=MJPEG):
-        cameras.append(NetworkCamera(timed(list(parts), at_s), kind))
-        frames, ages_s, lines = [], [], []
-        source = CameraStream(cameras[-1].address, SMALL_WH).frames(lambda: 0.0, lambda: False)
-        with contextlib.closing(source):
-            for frame in source:
-                if isinstance(frame, SourceFrame):
-                    frames.append(frame)
-                    ages_s.append(time.monotonic() - frame.arrived_s)
-                    time.sleep(work_s)
-                else:
-                    lines.append(frame)
-                    if "broken off" in frame:
-                        return frames, ages_s, lines
-        raise AssertionError("a stream that breaks off is tried again")
-
-    yield take
-    for camera in cameras:
-        camera.stop()
-
-
-@pytest.mark.slow
-def test_a_stream_without_times_of_its_own_says_so_once_and_loses_no_frame(taken):
-    """FFmpeg invents 25 frames per second for images over HTTP; the program takes longer than the camera.
-
-    Found: a frame that could be read at once was taken for one that had waited, and left out. Frames that have waited
-    tell their age, so that a session leaves them out: in the buffers of a stream, they looked as new as the last one.
-    """
-    images = [np.full((*SMALL_WH[::-1], 3), 2 * number, np.uint8) for number in range(60)]
-    # Five frames together: four of them are there when they are asked for.
-    frames, ages_s, lines = taken(map(jpeg_part, images), np.arange(60) // 5 * 5 / 12, work_s=0.1)
-    # The last image is complete only when the next one begins.
-    assert len(frames) >= 59
-    levels = [frame.image.mean() for frame in frames]
-    assert np.abs(np.diff(levels) - 2).max() < 1.5
-    # 59 frames that take 17 ms longer than they are apart.
-    assert ages_s[-1] > 0.5
-    assert len([line for line in lines if "frames are timed when they arrive" in line]) == 1
-    assert all(frame.time_s == frame.arrived_s for frame in frames)
-
-
-@pytest.mark.slow
-def test_the_times_of_a_stream_are_used_and_said(taken, tmp_path, caplog):
-    """A Matroska stream has times; its packets come late by up to 30 ms."""
-    path, count = tmp_path / "film.mkv", 150
-    writer = cv2.VideoWriter(f"{path}", cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), FPS, SMALL_WH)
-    for index in range(count):
-        writer.write(noise(index, SMALL_WH))
-    writer.release()
-    # Each part ends with the end of a JPEG image.
-    parts = re.findall(rb".+?\xff\xd9|.+", path.read_bytes(), re.DOTALL)
-    assert len(parts) == count + 1
-    late_s = np.random.default_rng(0).exponential(0.012, count + 1).clip(max=0.03)
-    with caplog.at_level("INFO", "psotrack"):
-        frames, _, lines = taken(parts, np.arange(count + 1) / FPS + late_s, kind="video/x-matroska")
-    assert any(line.endswith(": frames are timed by the stream") for line in caplog.messages)
-    assert not [line for line in lines if "when they arrive" in line]
-    # Where a frame that is less late than all before comes, the times go back by the difference.
-    times_s, arrived_s = (
-        np.diff([getattr(frame, name) for frame in frames[-40:]]) for name in ("time_s", "arrived_s")
-    )
-    assert np.median(np.abs(times_s - 1 / FPS)) < 0.0006  # the stream's times are whole milliseconds
-    assert np.median(np.abs(arrived_s - 1 / FPS)) > 0.004
 
 
 # --- instants
@@ -335,16 +261,17 @@ def test_cameras_have_the_short_names_of_other_commands(laboratory: Recording) -
     assert cameras[1].source == CameraStream(f"rtsp://camera/{RIG.names[2]}", SIZE_WH)
 
 
-def noise(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:
-    return np.random.default_rng(index).integers(0, 255, (size_wh[1], size_wh[0], 3), dtype=np.uint8)
+def noise(index: int) -> np.ndarray:
+    return np.random.default_rng(index).integers(0, 255, (*SIZE_WH[::-1], 3), dtype=np.uint8)
 
 
 def record(recorder: CameraRecorder, images: Iterable[np.ndarray], first: int = 0) -> None:
     """Record frames at 25 Hz, as fast as they are encoded."""
-    for index, image in enumerate(images):
-        recorder.write(image, (first + index) / FPS)
+    times = recorder.times
+    for count, image in enumerate(images, start=1):
+        recorder.write(image, (first + count - 1) / FPS)
         # The row of a frame is written just before it is encoded.
-        wait_for_lines(recorder.times, index + 2)
+        wait_until(lambda count=count: times.exists() and times.read_text().count("\n") > count)
 
 
 def test_what_was_filmed_is_a_recording(laboratory: Recording, tmp_path: Path) -> None:
@@ -455,7 +382,6 @@ def test_the_folder_of_a_recording_keeps_other_files(laboratory: Recording, tmp_
 BAD_FOLDERS = {
     "laboratory": "--record: expected another folder",
     "odd": "even numbers of pixels",
-    "file/flight": "expected a folder that can be written",
     "file": "expected a folder that can be written, found File exists",
 }
 

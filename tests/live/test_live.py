@@ -1,57 +1,278 @@
 """`psotrack live`: replayed files give the tracks of `track --causal`; cameras, devices, clients and disks fail.
 
-What goes wrong while it runs is one line, and the others go on.
+Cameras on the network, their streams and the clients of WebSockets have real sockets. What goes wrong while it runs is
+one line, and the others go on.
 """
 
 from __future__ import annotations
 
 import contextlib
 import faulthandler
+import http.server
 import json
 import os
+import re
 import signal
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 import worlds
-from helpers import assert_refused, listening_at
-from network_cameras import (
-    CAMERAS,
-    EFFORT,
-    NUM_FRAMES,
-    NetworkCamera,
-    film,
-    free_port,
-    jpeg_part,
-    laboratory_of,
-    live_sequence,
-    rows_of,
-    wait_for_lines,
-    wait_until,
-)
+from helpers import assert_refused, listening_at, make_once
+from small_sweeps import wait_until
 
 from psotrack.errors import InputError
-from psotrack.live import CameraStream, LiveSession, UdpLines, live_cameras
+from psotrack.geometry.rig_files import write_rig
+from psotrack.live import (
+    CameraStream,
+    LiveSession,
+    SourceFrame,
+    UdpLines,
+    WebSocketLines,
+    lines_of,
+    live_cameras,
+)
+from psotrack.recordings import probe, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.trajectories import read_trajectories
+from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
+from psotrack.trajectories import Status, Trajectories, read_trajectories
 
+#: Few, small cameras: a machine that is busy with other tests must keep up with the replay.
+CAMERAS, NUM_FRAMES, SCALE = ("cam1", "cam2", "cam3", "cam4"), 40, 0.25
+SIZE_WH = (480, 270)
+#: A program is compiled for 1, 2 and 4 drones.
+EFFORT = ["--particles", "20", "--iterations", "15", "--most-drones", "4"]
+MJPEG = "multipart/x-mixed-replace; boundary=frame"
+#: Size of small images of streams.
+SMALL_WH = (64, 48)
 AGAIN = "it is tried again every second"
 #: Speed of replays.
 SPEED = "0.2"
 
 
+# --- cameras on the network
+
+
+class NetworkCamera(http.server.ThreadingHTTPServer):
+    """A camera that sends the parts of a stream to each connection, in a thread of this process.
+
+    Args:
+        parts: makes the parts of one connection's stream, and sleeps between them.
+        kind: type of the stream's content.
+        port: port of this computer; 0 for a free one.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, parts: Callable[[], Iterable[bytes]], kind: str = MJPEG, port: int = 0) -> None:
+        camera = self
+        self.has_ended = False
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if self.path == "/nothing":
+                    self.send_error(404)
+                    return
+                self.send_response(200)
+                self.send_header("Content-Type", kind)
+                self.end_headers()
+                try:
+                    for part in parts():
+                        if camera.has_ended:
+                            return
+                        self.wfile.write(part)
+                except OSError:  # the client has gone
+                    return
+
+            def log_message(self, *arguments: object) -> None:
+                pass
+
+        super().__init__(("127.0.0.1", port), Handler)
+        threading.Thread(target=self.serve_forever, daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}/"
+
+    def stop(self) -> None:
+        """End all connections, and answer no others."""
+        self.has_ended = True
+        self.shutdown()
+        self.server_close()
+
+
+def jpeg_part(image: np.ndarray) -> bytes:
+    coded = cv2.imencode(".jpg", image)[1].tobytes()
+    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(coded)}\r\n\r\n"
+    return head.encode() + coded + b"\r\n"
+
+
+def timed(parts: list[bytes], at_s: np.ndarray) -> Callable[[], Iterator[bytes]]:
+    """Parts that come at given times after a connection's beginning."""
+
+    def stream() -> Iterator[bytes]:
+        began_s = time.monotonic()
+        for part, part_s in zip(parts, at_s.tolist(), strict=True):
+            time.sleep(max(0.0, began_s + part_s - time.monotonic()))
+            yield part
+
+    return stream
+
+
+def film(video: Path, port: int = 0) -> NetworkCamera:
+    """A camera that sends the frames of a video again and again, 10 per second, as a busy machine must keep up."""
+    parts = [jpeg_part(image) for image in read_frames(probe(video))]
+
+    def stream() -> Iterator[bytes]:
+        while True:
+            # All cameras show the same moment, as cameras of one room do.
+            yield parts[int(time.time() * 10) % len(parts)]
+            time.sleep(0.1 - time.time() % 0.1)
+
+    return NetworkCamera(stream, port=port)
+
+
+def laboratory_of(folder: Path, sequence: Path, keys: Mapping[str, str]) -> Path:
+    """A recording.toml with the rig of a sequence, and TOML keys of some of its cameras."""
+    write_rig(folder / "rig.toml", open_recording(sequence).rig.select(list(keys)))
+    tables = "".join(f"[cameras.{name}]\n{text}\n" for name, text in keys.items())
+    path = folder / "recording.toml"
+    path.write_text(f'version = 1\ncalibration = "rig.toml"\n{tables}')
+    return path
+
+
+def wait_for_lines(path: Path, count: int) -> None:
+    wait_until(lambda: path.exists() and path.read_text().count("\n") >= count)
+
+
+def free_port() -> int:
+    """A port at which nobody listens."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def rows_of(frame: int, num_drones: int = 4) -> Trajectories:
+    """Rows of an instant, which differ from frame to frame."""
+    shape = (1, num_drones, 3)
+    return Trajectories(
+        np.array([frame]),
+        np.array([frame / 25]),
+        tuple(map(str, range(num_drones))),
+        np.random.default_rng(frame).normal(size=shape),
+        velocity_m_s=np.ones(shape),
+        status=np.full(shape[:2], int(Status.TRACKED)),
+        covariance_m2=np.tile(np.eye(3), (1, num_drones, 1, 1)),
+    )
+
+
+# --- streams
+
+
+@pytest.fixture
+def cameras() -> Iterator[list[NetworkCamera]]:
+    """Cameras that are stopped after the test."""
+    made: list[NetworkCamera] = []
+    yield made
+    for camera in made:
+        if not camera.has_ended:
+            camera.stop()
+
+
+@pytest.fixture
+def taken(cameras: list[NetworkCamera]) -> Callable[..., tuple[list[SourceFrame], list[float], list[str]]]:
+    """Gives the frames of a stream until it breaks off, their ages when they are taken, and what is said."""
+
+    def take(parts, at_s, work_s=0.0, kind=MJPEG):
+        cameras.append(NetworkCamera(timed(list(parts), at_s), kind))
+        frames, ages_s, lines = [], [], []
+        source = CameraStream(cameras[-1].address, SMALL_WH).frames(lambda: 0.0, lambda: False)
+        with contextlib.closing(source):
+            for frame in source:
+                if isinstance(frame, SourceFrame):
+                    frames.append(frame)
+                    ages_s.append(time.monotonic() - frame.arrived_s)
+                    time.sleep(work_s)
+                else:
+                    lines.append(frame)
+                    if "broken off" in frame:
+                        return frames, ages_s, lines
+        raise AssertionError("a stream that breaks off is tried again")
+
+    return take
+
+
+@pytest.mark.slow
+def test_a_stream_without_times_of_its_own_says_so_once_and_loses_no_frame(taken):
+    """FFmpeg invents 25 frames per second for images over HTTP; the program takes longer than the camera.
+
+    Found: a frame that could be read at once was taken for one that had waited, and left out. Frames that have waited
+    tell their age, so that a session leaves them out: in the buffers of a stream, they looked as new as the last one.
+    """
+    images = [np.full((*SMALL_WH[::-1], 3), 2 * number, np.uint8) for number in range(60)]
+    # Five frames together: four of them are there when they are asked for.
+    frames, ages_s, lines = taken(map(jpeg_part, images), np.arange(60) // 5 * 5 / 12, work_s=0.1)
+    # The last image is complete only when the next one begins.
+    assert len(frames) >= 59
+    levels = [frame.image.mean() for frame in frames]
+    assert np.abs(np.diff(levels) - 2).max() < 1.5
+    # 59 frames that take 17 ms longer than they are apart.
+    assert ages_s[-1] > 0.5
+    assert len([line for line in lines if "frames are timed when they arrive" in line]) == 1
+    assert all(frame.time_s == frame.arrived_s for frame in frames)
+
+
+@pytest.mark.slow
+def test_the_times_of_a_stream_are_used_and_said(taken, tmp_path, caplog):
+    """A Matroska stream has times; its packets come late by up to 30 ms."""
+    path, count, rng = tmp_path / "film.mkv", 150, np.random.default_rng(0)
+    writer = cv2.VideoWriter(f"{path}", cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SMALL_WH)
+    for _ in range(count):
+        writer.write(rng.integers(0, 255, (*SMALL_WH[::-1], 3), np.uint8))
+    writer.release()
+    # Each part ends with the end of a JPEG image.
+    parts = re.findall(rb".+?\xff\xd9|.+", path.read_bytes(), re.DOTALL)
+    assert len(parts) == count + 1
+    late_s = rng.exponential(0.012, count + 1).clip(max=0.03)
+    with caplog.at_level("INFO", "psotrack"):
+        frames, _, lines = taken(parts, np.arange(count + 1) / 25 + late_s, kind="video/x-matroska")
+    assert any(line.endswith(": frames are timed by the stream") for line in caplog.messages)
+    assert not [line for line in lines if "when they arrive" in line]
+    # Where a frame that is less late than all before comes, the times go back by the difference.
+    times_s, arrived_s = (
+        np.diff([getattr(frame, name) for frame in frames[-40:]]) for name in ("time_s", "arrived_s")
+    )
+    assert np.median(np.abs(times_s - 1 / 25)) < 0.0006  # the stream's times are whole milliseconds
+    assert np.median(np.abs(arrived_s - 1 / 25)) > 0.004
+
+
+def client() -> ModuleType:
+    """Clients of WebSockets, if they are installed."""
+    return pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
+
+
+# --- sessions
+
+
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return live_sequence(tmp_path_factory)
+    """A simulated flight of four drones."""
+
+    def make(folder: Path) -> None:
+        recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners"})
+        settings = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+        simulate(recipe, folder, settings, jobs=1)
+
+    return make_once(tmp_path_factory, "live_sequence", make) / "Simulated_Data" / "S02_D4_A"
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +284,6 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.getbasetemp() / "live_cache"
-
-
-@pytest.fixture
-def cameras() -> Iterator[list[NetworkCamera]]:
-    """Cameras that are stopped after the test."""
-    made: list[NetworkCamera] = []
-    yield made
-    for camera in made:
-        if not camera.has_ended:
-            camera.stop()
 
 
 @pytest.fixture
@@ -118,7 +329,6 @@ def datagrams() -> Iterator[tuple[str, list[str]]]:
 def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
     sequence: Path, cache: Path, tmp_path: Path, run_psotrack, meanwhile
 ) -> None:
-    client = pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
     # Two of the cameras have rolling shutters: a frame has the time of its middle row, 2.7 ms after its first row.
     lines = {name: "line_time_s = 2e-5" if name in CAMERAS[:2] else "" for name in CAMERAS}
     keys = {name: f'video = "{sequence / name}i_s.avi"\n{line}' for name, line in lines.items()}
@@ -131,11 +341,12 @@ def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
             return one.connect_ex(("127.0.0.1", port)) == 0
 
     def listen() -> None:
-        wait_until(answers, f"nobody answers at port {port}")
+        wait_until(answers)
         assert listening_at(os.getpid()) == {"127.0.0.1"}
-        with client.connect(f"ws://127.0.0.1:{port}") as connection:
+        with client().connect(f"ws://127.0.0.1:{port}") as connection:
             received.extend(connection)
 
+    client()
     meanwhile(listen)
     with datagrams() as (address, sent):
         # Slow enough for a machine that is busy with other tests.
@@ -200,10 +411,10 @@ def test_cameras_stop_come_back_are_missing_or_send_another_size(
         wait_for_lines(table, 20)
         gone = cameras[1]
         gone.stop()
-        wait_until(lambda: any("has broken off" in line for line in caplog.messages), "nobody says it")
+        wait_until(lambda: any("has broken off" in line for line in caplog.messages))
         wait_for_lines(table, table.read_text().count("\n") + 20)
         cameras.append(film(sequence / "cam2i_s.avi", gone.server_address[1]))
-        wait_until(lambda: "camera cam2 films again" in caplog.messages, "the camera does not come back")
+        wait_until(lambda: "camera cam2 films again" in caplog.messages)
         wait_for_lines(table, table.read_text().count("\n") + 20)
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -257,7 +468,6 @@ BAD = {
     "files": (["--lines"], "the number of a device as `video`, found none; --replay plays the videos"),
     "another kind of file": (["--replay", "--out", "tracks.txt"], "ends in .csv"),
     "no address": (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
-    "no port": (["--replay", "--websocket", "nowhere"], "--websocket: expected PORT or HOST:PORT"),
     "no such camera": (
         ["--lines", "--replay", "--cameras", "c1,c9"],
         "cameras: expected some of c0, c1, c2, found c9",
@@ -382,3 +592,132 @@ def test_a_signal_that_comes_while_another_one_stops_the_session(flight: Path) -
     sender.join()
     faulthandler.cancel_dump_traceback_later()
     signal.signal(signal.SIGINT, before)
+
+
+# --- clients of WebSockets
+
+
+@pytest.fixture
+def port() -> int:
+    client()
+    return free_port()
+
+
+@pytest.fixture
+def server(port: int) -> Iterator[WebSocketLines]:
+    server = WebSocketLines(f"{port}")
+    yield server
+    server.close()
+
+
+def connected(port: int, server: WebSocketLines, **options: object):
+    """A client, once the server knows it."""
+    before = server.num_clients
+    connection = client().connect(f"ws://127.0.0.1:{port}", **options)
+    wait_until(lambda: server.num_clients > before)
+    return connection
+
+
+def deaf_client(port: int, server: WebSocketLines) -> socket.socket:
+    """A client that connects and never reads a message."""
+    before = server.num_clients
+    one = socket.socket()
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    one.connect(("127.0.0.1", port))
+    one.sendall(
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    )
+    wait_until(lambda: server.num_clients > before)
+    return one
+
+
+def test_all_clients_get_every_row_as_a_message_before_the_end(port: int) -> None:
+    server = WebSocketLines(f"127.0.0.1:{port}")
+    server.write(rows_of(0))  # nobody listens yet
+    with connected(port, server) as first, connected(port, server) as second:
+        for frame in range(1, 31):
+            server.write(rows_of(frame))
+        closing = threading.Thread(target=server.close)
+        closing.start()
+        expected = [line for frame in range(1, 31) for line in lines_of(rows_of(frame))]
+        assert [*first] == expected
+        assert [*second] == expected
+        closing.join()
+    row = json.loads(expected[0])
+    assert (row["frame"], row["status"]) == (1, "tracked")
+    assert np.allclose(row["position_m"], rows_of(1).position_m[0, 0])
+
+
+def test_a_client_that_never_reads_is_disconnected_and_slows_nobody(port: int) -> None:
+    server, num_bytes, frame = WebSocketLines(f"{port}", asked_s=0.4), 0, 0
+    with contextlib.closing(server), deaf_client(port, server) as deaf, connected(port, server) as connection:
+        # For longer than it takes to ask a client and to wait for its answer.
+        ends_s = time.monotonic() + 1.6
+        while time.monotonic() < ends_s:
+            rows, frame = rows_of(frame, num_drones=16), frame + 1
+            server.write(rows)
+            received = [connection.recv(timeout=10) for _ in range(16)]
+            assert received == lines_of(rows)
+            num_bytes += sum(map(len, received))
+        deaf.settimeout(10)
+        with contextlib.suppress(ConnectionResetError):
+            # To the end of the connection, which came before the last rows.
+            assert len(b"".join(iter(lambda: deaf.recv(2**20), b""))) < 0.9 * num_bytes
+
+
+def test_a_client_that_does_not_read_cannot_hold_up_the_end(port: int) -> None:
+    server = WebSocketLines(f"{port}")
+    with deaf_client(port, server):
+        # More than the system's buffers take, and less than what may wait in the server, so that it is connected.
+        for frame in range(10):
+            server.write(rows_of(frame, num_drones=200))
+        # A second for the client to close; a server that waits for it would never end.
+        server.close()
+
+
+def test_clients_that_vanish_do_no_harm(port: int, server: WebSocketLines) -> None:
+    vanished = deaf_client(port, server)
+    # A reset instead of an orderly end.
+    vanished.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\x00\x00\x00\x00\x00\x00\x00")
+    vanished.close()
+    with socket.create_connection(("127.0.0.1", port)) as stranger:
+        stranger.sendall(b"this is no WebSocket client\r\n\r\n")
+    with connected(port, server) as connection:
+        for frame in range(5):
+            server.write(rows_of(frame, 1))
+        assert [json.loads(connection.recv(timeout=10))["frame"] for _ in range(5)] == list(range(5))
+
+
+def test_only_pages_of_this_computer_may_read(port: int, server: WebSocketLines) -> None:
+    with connected(port, server, origin="http://localhost:8000") as connection:
+        server.write(rows_of(0, 1))
+        assert json.loads(connection.recv(timeout=10))["frame"] == 0
+    with pytest.raises(client().InvalidStatus, match="403"):
+        client().connect(f"ws://127.0.0.1:{port}", origin="https://example.com")
+
+
+#: Address -> words of the line.
+BAD_ADDRESSES = {
+    **dict.fromkeys(
+        ("", "nowhere", "127.0.0.1:", "9000:", "0", "70000", "1.5", "٣"),
+        "--websocket: expected PORT or HOST:PORT",
+    ),
+    "no.such.host.invalid:9000": "expected an address of this computer",
+}
+
+
+@pytest.mark.usefixtures("port")
+@pytest.mark.parametrize("address", BAD_ADDRESSES)
+def test_an_address_that_is_none(address: str, tmp_path: Path) -> None:
+    assert_refused(lambda: WebSocketLines(address), BAD_ADDRESSES[address], unchanged=tmp_path)
+
+
+def test_a_port_in_use_is_one_line(port: int, server: WebSocketLines, tmp_path: Path) -> None:
+    words = "expected an address of this computer that is free", "in use"
+    assert_refused(lambda: WebSocketLines(f"{port}"), *words, unchanged=tmp_path)
+
+
+def test_without_the_package_the_error_says_how_to_install_it(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    assert_refused(lambda: WebSocketLines("9000"), "pip install '.[live]'", unchanged=tmp_path)

@@ -1,0 +1,310 @@
+"""What all commands have: help, completion in shells, --progress, --log, --config and --save-config."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import cv2
+import numpy as np
+import pytest
+from helpers import Output, assert_refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psotrack import cli
+from psotrack.cli.lazy import LazyGroup
+from psotrack.cli.output import Output as Printer
+from psotrack.cli.settings import config_text, read_config
+from psotrack.settings import TrackSettings
+from psotrack.trajectories import Status, Trajectories
+
+Run = Callable[..., Output]
+
+#: A line of a log: local time with its offset, level, and what was said.
+LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (info|warning|error) (.*)")
+#: Packages that only commands need.
+HEAVY = ("cv2", "jax", "matplotlib", "msgspec", "numpy", "pandas", "rich", "scipy", "trimesh", "zarr")
+
+#: Runs `psotrack` with the words of each argument, and prints the heavy packages that are imported after each.
+REPORT_IMPORTS = f"""
+import contextlib, io, sys
+from psotrack.cli import main
+for words in sys.argv[1:]:
+    sys.argv = ["psotrack", *words.split()]
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        main()
+    print(*sorted(set({HEAVY!r}) & set(sys.modules)), sep=" ")
+"""
+
+
+def every_command(group: click.Group = cli.cli, words: str = "") -> Iterator[tuple[str, click.Command]]:
+    """Every command with what is typed for it, groups included."""
+    yield words.strip() or "psotrack", group
+    for name, command in ((name, group.commands[name]) for name in group.list_commands(click.Context(group))):
+        if isinstance(command, click.Group):
+            yield from every_command(command, f"{words} {name}")
+        else:
+            yield f"{words} {name}".strip(), command
+
+
+EVERY_COMMAND = dict(every_command())
+
+
+def test_summaries_are_the_first_sentences_of_the_commands(run_psotrack: Run) -> None:
+    """They are written a second time, because help must not import the commands."""
+    groups = [command for command in EVERY_COMMAND.values() if isinstance(command, LazyGroup)]
+    assert cli.cli in groups
+    for group in groups:
+        assert len(group.places) >= 2
+        for name in group.places:
+            command = group.commands[name]
+            assert command.name == name
+            assert group.summary(name) == command.get_short_help_str(limit=1000), name
+    result = run_psotrack("--help")
+    assert result.code == 0
+    words = " ".join(result.out.split())
+    for name in cli.cli.places:
+        assert f" {name} {cli.cli.summary(name)}" in words
+    for shell in ("bash", "zsh", "fish"):
+        assert f"_PSOTRACK_COMPLETE={shell}_source psotrack" in result.out
+
+
+@pytest.mark.parametrize("words", EVERY_COMMAND)
+def test_help_fits_two_screens_and_has_an_example(words: str) -> None:
+    command = EVERY_COMMAND[words]
+    context = click.Context(command, info_name=f"psotrack {words}", terminal_width=100, max_content_width=100)
+    text = command.get_help(context)
+    assert len(text.splitlines()) <= 80
+    if not isinstance(command, click.Group):
+        assert re.search(rf"Examples?:\n +psotrack {words.removesuffix(' sequence')}\b", text)
+
+
+@pytest.mark.parametrize("words", EVERY_COMMAND)
+def test_help_names_the_default_that_an_option_has(words: str) -> None:
+    context = click.Context(EVERY_COMMAND[words], resilient_parsing=True)
+    for option in EVERY_COMMAND[words].params:
+        if not isinstance(option, click.Option) or option.is_eager:
+            continue
+        shown = (option.get_help_record(context) or ("", ""))[1]
+        stated = re.findall(r"\[(?:.*; )?default: (.*?)(?:;.*)?\]", shown)
+        default = option.get_default(context)
+        if option.is_flag:
+            default = option.opts[0] if default is True else None
+        if isinstance(default, tuple):
+            default = ",".join(map(str, default))
+        if default is not None and default is not False and default not in ("", click.core.UNSET):
+            assert stated == [str(default)], option.name
+        elif option.callback is None:
+            # Words say what happens without the option: never a number that the program does not have.
+            assert not any(re.fullmatch(r"[\d.]+", each) for each in stated), option.name
+
+
+def test_help_and_names_of_commands_import_no_heavy_package() -> None:
+    """Help of a command imports the defaults of settings alone. Each process imports what came before."""
+    light, settings = ["--help", "--version", "calibrate --help"], ["onboard localise", "simulate sequence"]
+    words = [*light, *(f"{command} --help" for command in (*settings, "detect", "sweep", "track"))]
+    result = subprocess.run(
+        [sys.executable, "-c", REPORT_IMPORTS, *words], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.splitlines() == [""] * len(light) + ["msgspec"] * (len(words) - len(light))
+
+
+# --- completion
+
+
+@pytest.fixture
+def complete(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+    """Runs `psotrack` as a shell does that wants completions."""
+
+    def call(shell: str, **environment: str) -> Output:
+        monkeypatch.setenv("_PSOTRACK_COMPLETE", shell)
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        return run_psotrack()
+
+    return call
+
+
+def test_an_unknown_shell_is_one_line(complete: Run, tmp_path: Path) -> None:
+    shells = "bash_source, zsh_source or fish_source"
+    assert_refused(lambda: complete("tcsh_source"), shells, unchanged=tmp_path)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_gets_the_script_that_asks_for_completions(complete: Run, shell: str) -> None:
+    if shell == "bash" and not shutil.which("bash"):
+        pytest.skip("click runs bash to find its version")
+    script = complete(f"{shell}_source").out
+    assert f"_PSOTRACK_COMPLETE={shell}_complete" in script
+    assert re.search(r"^\s*(complete|compdef) .*psotrack", script, re.MULTILINE)
+
+
+def test_commands_and_options_are_completed(complete: Run) -> None:
+    """The script of a shell runs psotrack with what was typed in variables of the environment."""
+
+    def completions(words: list[str], incomplete: str) -> set[str]:
+        """Completions after `words` and the first characters of the next word."""
+        typed = {"COMP_WORDS": " ".join([*words, incomplete]), "COMP_CWORD": str(len(words))}
+        result = complete("bash_complete", **typed)
+        assert result.code == 0, result
+        return {line.split(",", 1)[1] for line in result.out.splitlines()}
+
+    assert completions(["psotrack"], "s") == {"simulate", "sweep"}
+    assert completions(["psotrack", "calibrate"], "c") == {"convert"}
+    options = {"--scenario", "--set", "--show", "--scale", "--seed"}
+    assert completions(["psotrack", "simulate", "sequence"], "--s") == options
+    assert completions(["psotrack", "onboard", "fuse", "--at"], "") == {"camera", "middle"}
+
+
+# --- --progress, --log, --config and --save-config, and the table of `track`
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+    """Runs `psotrack` with some arguments, with the progress that users see."""
+    monkeypatch.delenv("PSOTRACK_PROGRESS", raising=False)
+    return run_psotrack
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> list[object]:
+    """Arguments of a command that takes a moment: `onboard detect` in a photograph of a marker."""
+    path = tmp_path / "photograph.png"
+    marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 100)
+    cv2.imwrite(str(path), np.pad(marker, 40, constant_values=255))
+    return ["onboard", "detect", path, "--out", tmp_path / "markers.csv", "--force", "--json", "-"]
+
+
+def said_in(log: Path) -> list[tuple[str, str]]:
+    """Level and text of each line of a log."""
+    matches = [LINE.fullmatch(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    assert all(matches)
+    return [(match[1], match[2]) for match in matches if match]
+
+
+def test_progress(run: Run, command: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short work is quiet, lines say what was done, --quiet has precedence, and a variable chooses."""
+    assert run(*command).err == run(*command, "--progress", "none").err == ""
+    code, out, err = run(*command, "--progress", "lines")
+    assert code == 0
+    assert json.loads(out)
+    assert re.fullmatch(r"psotrack: markers: 1 of 1 in \d+\.\d s\n", err)
+    assert "1/1" in run(*command, "--progress", "bar").err
+    assert run(*command, "--progress", "lines", "--quiet").err == ""
+    monkeypatch.setenv("PSOTRACK_PROGRESS", "lines")
+    assert "markers: 1 of 1" in run(*command).err
+    assert run(*command, "--progress", "none").err == ""
+
+
+def test_a_log_grows(run: Run, command: list[object], tmp_path: Path) -> None:
+    log = tmp_path / "logs" / "all.log"
+    command = [*command[:5], "--log", log]
+    out = run(*command).out
+    lines = said_in(log)
+    assert lines[0][1].startswith("psotrack ")
+    assert lines[0][1].endswith(f"--log {log}")
+    assert any(re.fullmatch(r"markers: 1 of 1 in \d+\.\d s", text) for _, text in lines)
+    assert lines[-1] == ("info", out.strip())
+    code, _, err = run(*command, "--quiet")
+    assert code == 2
+    again = said_in(log)
+    assert again[: len(lines)] == lines
+    # The error on stderr without the name of the program.
+    assert again[-1] == ("error", err.strip().removeprefix("psotrack: "))
+    # Nothing is logged after the command; wrong options after the log are.
+    assert run(*command[:5], "--force").code == 0
+    assert said_in(log) == again
+    assert run("track", tmp_path, "--log", log, "--out", "t.txt").code == 2
+    assert said_in(log)[-1][0] == "error"
+
+
+def test_results_and_folders_are_no_logs(run: Run, command: list[object], tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks.csv"
+    tracks.write_text("frame,drone\n", encoding="utf-8")
+    refusal = "expected a new file, or a log of psotrack"
+    assert_refused(lambda: run(*command, "--log", tracks), refusal, unchanged=tmp_path)
+    refusal = "a log file that can be written"
+    assert_refused(lambda: run(*command, "--log", tmp_path), refusal, unchanged=tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_the_work_goes_on_where_the_log_meets_a_full_disk(run: Run, command: list[object]) -> None:
+    code, out, err = run(*command, "--log", "/dev/full")
+    assert code == 0
+    assert json.loads(out)
+    assert err == "psotrack: warning: /dev/full: No space left on device; the log ends here\n"
+
+
+texts = st.text(st.characters(exclude_categories=("Cs", "Cc")), min_size=1).filter(
+    lambda text: not text.startswith("-")
+)
+
+
+#: Any values that some settings may have.
+SETTINGS = st.fixed_dictionaries(
+    {},
+    optional={
+        "swarm.particles": st.integers(2, 100_000),
+        "motion.max_speed_m_s": st.floats(1e-3, 1e9),
+        # Files have no numbers above 1e60.
+        "rate_hz": st.floats(1e-300, 1e60),
+        "drones.size_m": st.tuples(*[st.floats(1e-3, 1e9)] * 3),
+        "clocks": st.sampled_from(["given", "auto"]),
+        "method": texts,
+        "smooth": st.booleans(),
+        "silhouettes.reduction": st.integers(1, 64),
+    },
+)
+
+
+# To read all settings takes a tenth of a second.
+@settings(max_examples=10)
+@given(values=SETTINGS)
+def test_a_saved_config_has_all_settings(tmp_path_factory: pytest.TempPathFactory, values: Any) -> None:
+    saved = TrackSettings().changed(values)
+    file = tmp_path_factory.getbasetemp() / "saved_config.toml"
+    file.write_text(config_text(saved), encoding="utf-8")
+    assert TrackSettings().changed(read_config(file)) == saved
+
+
+def test_a_run_that_fails_saves_no_config(run: Run, tmp_path: Path) -> None:
+    words = ("track", tmp_path, "--out", tmp_path / "t.csv", "--save-config", tmp_path / "b.toml")
+    assert_refused(lambda: run(*words), unchanged=tmp_path)
+
+
+def test_the_table_of_drones_has_eighty_columns_and_no_cell_is_cut(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    names = (*map(str, range(10)), "[red]a drone with a long name")
+    drones, frames = len(names), 40
+    tracks = Trajectories(
+        np.arange(frames),
+        # Times of more than a day, and 12 m of standard deviation.
+        90_000 + np.arange(frames) / 25,
+        names,
+        np.ones((frames, drones, 3)),
+        status=np.full((frames, drones), Status.TRACKED),
+        covariance_m2=np.tile(144.0 * np.eye(3), (frames, drones, 1, 1)),
+        num_cameras=np.full((frames, drones), 40),
+    )
+    for hidden in (Printer(quiet=True), Printer(json_path=Path("-"))):
+        hidden.drones(tracks)
+    assert capsys.readouterr().out == ""
+    Printer().drones(tracks, np.full((drones, 3), 1.234))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line[:1].isdigit()}
+    first = ["100.0%", "0.0%", "0.0%", "40.0", "12000", "123", "123", "123", "90000", "90002"]
+    assert rows["0"] == first
+    # The long name is folded, not cut, and no part of it is a style.
+    last = next(number for number, line in enumerate(lines) if line.startswith("9 "))
+    folded = "".join(line.partition("100.0%")[0] for line in lines[last + 1 :])
+    assert folded.replace(" ", "") == names[-1].replace(" ", "")
