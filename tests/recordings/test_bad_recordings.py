@@ -103,7 +103,6 @@ SEQUENCES = {
              ": expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x[ft]"),
     "a column twice": (edit(CAMERAS, "cam_y[m]", "cam_x[m]"), ", line 1: expected each column once, found cam_x again"),
     "five coefficients": (five_coefficients, "4 distortion coefficients, found 5"),
-    "no number": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;2;x"), ", line 3, column cam_y[m]: expected a number, found 'x'"),
     "a comma": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;2;0,5"), ", line 3", "found '0,5'; write decimals with a point"),
     "few values": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;0.5"), ", line 3: expected 10 values as in the header, found 9"),
     "a camera twice": (edit(CAMERAS, "cam2i;2", "cam1i_s;2"),
@@ -111,17 +110,10 @@ SEQUENCES = {
     "focal length 0": (edit(CAMERAS, "1158.3", "0"), "line 3, column focal_length: expected a focal length above 0 "),
     "a frame twice": (edit(POSES, "\n2;0.2", "\n1;0.2"),
                       "line 4, column id: expected each frame once, found 1 again, after line 3"),
-    "half a frame": (edit(POSES, "\n2;0.2", "\n2.5;0.2"), "column id: expected a whole number, 0 or more, found '2.5'"),
     "a long quaternion": (edit(POSES, "0;0;0;1\n2", "0;0;0;7\n2"),
                           "line 3, column q_w: expected a quaternion of length 1, found length 7"),
     "a drone twice": (copy(POSES, f"{S}/drone1_pos_25.csv"),
                       "drone1_pos_25.csv: expected one file per drone, found dron1 in ", "dron1_pos_25.csv as well"),
-}  # fmt: skip
-#: The same for the real sequence; which markers are drones' is said by the user.
-MOTION_CAPTURE = {
-    "two recordings": (copy(f"{R}/R99.c3d", f"{R}/R98.c3d"), None, "R99.c3d: expected one file per drone, found dron4"),
-    "bodies of none": (remove(f"{R}/*.c3d"), {"cf1": ["a"]},
-                       "bodies cf1: expected one C3D file that holds their markers, found none"),
 }  # fmt: skip
 #: The same for the cameras on drones.
 ONBOARD = {
@@ -135,7 +127,6 @@ ONBOARD = {
                       "line 3, column cam_name: expected each camera once, found dron1 again"),
     "below 0": (edit(INTRINSICS, "60.5", "-60.5"),
                 "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
-    "half a pixel": (edit(INTRINSICS, ";64", ";64.5"), "line 2, column width: expected a whole number"),
 }  # fmt: skip
 
 
@@ -169,7 +160,6 @@ KEYS = {
     'video = "left.zip"': (VIDEO, "unpack it first"),
     'video = "rtps://left/1"': ("a file, the number of a device, or an address that begins with rtsp://, rtsps://",),
     'video = "rtsp:///stream"': (VIDEO, HOST, "found rtsp:///stream"),
-    'video = "http://left:99999/"': (VIDEO, HOST),
     'video = "gstreamer://"': (VIDEO, HOST),
     "video = -1": (VIDEO, "expected the number of a device, from 0, found -1"),
     'video = "pictures"': ("cameras.left.fps", "expected frames per second of the pictures, or timestamps"),
@@ -258,11 +248,9 @@ LINE = "4,10,20,30,40,25,40,0.9"
 #: Second line of a file of detections -> words of the line.
 DETECTIONS = {
     "5,1,2,3,4,5,6": ("line 2: expected a frame number and 7 values per detection ", ", found 6 values"),
-    "5,1,2,3,4,5,6,x": ("line 2, column 8: expected a number, found 'x'",),
     "5,1,2,,4,5,6,0.5": ("line 2, column 4: expected a value, found nothing",),
     "5,1,2,-3,4,5,6,0.5": ("line 2, column 4: expected a size w of 0 or more pixels, found -3",),
     "5,1,2,3,4,5,6,1.5": ("line 2, column 8: expected a confidence from 0 to 1, found 1.5",),
-    "5.5,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '5.5'",),
     LINE: ("line 2, column 1: expected each frame once, found frame 4 again",),
 }
 WIDTH, HEIGHT = 64, 48
@@ -371,10 +359,8 @@ USABLE = {
     "no video is named": (three_cameras(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
     "no videos": (NO_VIDEOS, {}, "found none for a, b, c"),
     "smaller": (three_cameras(a=(1280, 720)), {}, SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
-    "larger": (three_cameras(c=(3840, 2160)), {}, SIZE.format("c", "3840 x 2160", f"{SCALED}2/1")),
     "another shape": (three_cameras(c=(1920, 1200)), {},
                       SIZE.format("c", "1920 x 1200", "is it the video of another camera?")),
-    "no frames": (three_cameras(), {"num_frames": 0}, "frames: expected 1 to 250, "),
     "more frames": (three_cameras(), {"num_frames": 251}, "frames: expected 1 to 250, "),
 }  # fmt: skip
 
@@ -484,18 +470,17 @@ OTHERS = {
     "more poses than turns": (nothing, poses([[1, 1, 1.0]], 0), "expected equal numbers of positions and orientations"),
     "no intrinsics": (nothing, intrinsics({}), "expected at least one camera, all without skew"),
     "intrinsics with skew": (nothing, intrinsics(SKEW), "expected at least one camera, all without skew"),
+    "two recordings": (copy(f"{R}/R99.c3d", f"{R}/R98.c3d"), opened(R),
+                       "R99.c3d: expected one file per drone, found dron4"),
+    "bodies of none": (remove(f"{R}/*.c3d"), lambda folder: read_sequence(folder / R, bodies={"cf1": ["a"]}),
+                       "bodies cf1: expected one C3D file that holds their markers, found none"),
     "no rate of nothing": (nothing, lambda _: NO_VIDEOS.fps, "S01: expected at least one video, found none"),
 }  # fmt: skip
-
-
-def real(bodies):
-    return lambda folder: read_sequence(folder / R, bodies=bodies)
 
 
 #: Name of the case, what happens to the folder, what is called, words of the line.
 BAD = [
     *((name, change, opened(S), words) for name, (change, *words) in SEQUENCES.items()),
-    *((name, change, real(bodies), words) for name, (change, bodies, *words) in MOTION_CAPTURE.items()),
     *(
         (name, change, lambda folder: read_onboard(folder / S), words)
         for name, (change, *words) in ONBOARD.items()
