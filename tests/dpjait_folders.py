@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from helpers import cameras_of
 
-from psotrack.recordings import VideoWriter
+from psotrack.geometry import make_camera, make_rig
+from psotrack.recordings import Recording, VideoInfo, VideoWriter
 from psotrack.recordings.mocap import Markers, write_c3d
 
 SIZE_WH, FPS, NUM_FRAMES = (64, 48), 25.0, 5
@@ -88,3 +91,24 @@ def edit(file: str, old: str, new: str, count: int = 1) -> Callable[[Path], None
         (folder / file).write_text(text.replace(old, new, count))
 
     return change
+
+
+LETTERS = ("a", "b", "c", "d", "e")
+PLAIN_K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+#: Fields of a camera at the origin.
+UPRIGHT = {"R": np.eye(3), "t_m": np.zeros(3), "K": PLAIN_K, "image_size_wh": (1920, 1080)}
+
+
+def full_hd_recording(**changes: dict[str, object] | None) -> Recording:
+    """A recording of five equal cameras, without files.
+
+    Args:
+        changes: Camera name -> fields of its `VideoInfo` that differ; None removes the camera's video.
+    """
+    videos = {
+        name: replace(VideoInfo(Path(f"{name}.avi"), 250, 25.0, (1920, 1080)), **(changes.get(name) or {}))
+        for name in LETTERS
+        if changes.get(name, {}) is not None
+    }
+    rig = make_rig({name: make_camera(**UPRIGHT) for name in LETTERS})
+    return Recording("S01", Path("S01"), cameras_of(rig, video=videos))

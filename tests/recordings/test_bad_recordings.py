@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from archives_made import OLD
-from dpjait_folders import edit, write_video
+from dpjait_folders import LETTERS, PLAIN_K, UPRIGHT, edit, full_hd_recording, write_video
 from helpers import assert_refused, cameras_of, ring_rig
 from worlds import make_tracks
 
@@ -22,7 +22,6 @@ from psotrack.recordings import (
     Detections,
     FrameTimes,
     Recording,
-    VideoInfo,
     VideoWriter,
     make_timeline,
     open_video,
@@ -335,33 +334,20 @@ FRAME_TIMES = {
     "a single time": (listed(0.0), "expected times of at least 2 frames, found 1"),
     "nothing from time 0 on": (timeline(FrameTimes(10, 25.0, -1.0)), "a camera with a frame at time 0 s or later"),
 }  # fmt: skip
-NAMES = ("a", "b", "c")
-FULL_HD = (1920, 1080)
-UPRIGHT = {"R": np.eye(3), "t_m": np.zeros(3), "image_size_wh": FULL_HD}
-PLAIN_K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
-
-
-def three_cameras(**sizes_wh):
-    """A recording of three equal cameras; a video has another size, or with None there is no video."""
-    videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, sizes_wh.get(name, FULL_HD)) for name in NAMES}
-    videos = {name: video for name, video in videos.items() if video.image_size_wh}
-    rig = make_rig({name: make_camera(K=PLAIN_K, **UPRIGHT) for name in NAMES})
-    return Recording("S01", Path("S01"), cameras_of(rig, video=videos))
-
-
-NO_VIDEOS = three_cameras(**dict.fromkeys(NAMES))
+NO_VIDEOS = full_hd_recording(**dict.fromkeys(LETTERS))
 SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
 SCALED = "if both show the same field of view, multiply the first two rows of K by "
 #: Name of the case -> recording, arguments of `usable`, words of the line.
 USABLE = {
-    "an unknown camera": (three_cameras(), {"cameras": ["a", "z"]}, "some of a, b, c, found z"),
-    "no name": (three_cameras(), {"cameras": []}, "cameras: expected some of a, b, c, found "),
-    "no video is named": (three_cameras(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
-    "no videos": (NO_VIDEOS, {}, "found none for a, b, c"),
-    "smaller": (three_cameras(a=(1280, 720)), {}, SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
-    "another shape": (three_cameras(c=(1920, 1200)), {},
+    "an unknown camera": (full_hd_recording(), {"cameras": ["a", "z"]}, "some of a, b, c, d, e, found z"),
+    "no name": (full_hd_recording(), {"cameras": []}, "cameras: expected some of a, b, c, d, e, found "),
+    "no video is named": (full_hd_recording(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
+    "no videos": (NO_VIDEOS, {}, "found none for a, b, c, d, e"),
+    "smaller": (full_hd_recording(a={"image_size_wh": (1280, 720)}), {},
+                SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
+    "another shape": (full_hd_recording(c={"image_size_wh": (1920, 1200)}), {},
                       SIZE.format("c", "1920 x 1200", "is it the video of another camera?")),
-    "more frames": (three_cameras(), {"num_frames": 251}, "frames: expected 1 to 250, "),
+    "more frames": (full_hd_recording(), {"num_frames": 251}, "frames: expected 1 to 250, "),
 }  # fmt: skip
 
 # --- tracks in the formats of other programs
@@ -433,7 +419,7 @@ EXPORTS = {
 
 # --- what the dataset's layout cannot hold
 
-SOUND = make_camera(K=PLAIN_K, **UPRIGHT)
+SOUND = make_camera(**UPRIGHT)
 #: Words of the line -> fields of a camera.
 LAYOUT = {
     "distortion by k1, k2, p1, p2 alone, found 5 coefficients": {"dist": (0.1, 0.0, 0.0, 0.0, 0.01)},
@@ -445,7 +431,7 @@ LAYOUT = {
 
 def calibration_of(fields):
     """The message names the camera that the file cannot hold, not the first one."""
-    camera = make_camera(**{"K": PLAIN_K, **UPRIGHT, **fields})
+    camera = make_camera(**UPRIGHT | fields)
     rig = make_rig({"a": SOUND, "GoPro 3": camera, "z": camera})
     return lambda folder: write_calibration(folder / "a.csv", rig)
 
@@ -459,7 +445,7 @@ def intrinsics(cameras):
     return lambda folder: write_onboard_calibration(folder / "a.csv", cameras)
 
 
-SKEW = {"dron1": (PLAIN_K + np.eye(3, k=1), FULL_HD)}
+SKEW = {"dron1": (PLAIN_K + np.eye(3, k=1), (1920, 1080))}
 #: Name of the case -> what happens to the folder, what is called, words of the line.
 OTHERS = {
     "marker twice": (corners("7;", "5;"), lambda folder: read_marker_corners(folder / MARKER_CORNERS),

@@ -43,7 +43,7 @@ OUTPUTS = {
 }
 #: Sizes of the two drones.
 SIZES_M = np.array([[0.5, 0.5, 0.2], [0.4, 0.4, 0.15]])
-LASTS_S = 1.0
+LASTS_S = 0.8
 #: Rate, time of frame 0 and time per row of each camera. The instants are those of the fastest camera.
 CLOCKS = {"c0": (25.0, 0.0, 0.0), "c1": (50.0, 0.0, 0.0), "c2": (25.0, 0.013, 2e-5)}
 

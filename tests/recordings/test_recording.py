@@ -1,16 +1,13 @@
 """Recordings: frames of all cameras meet at the instants of one clock, and `usable` accepts what belongs together."""
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
-from helpers import cameras_of, with_cameras
+from dpjait_folders import LETTERS, full_hd_recording
+from helpers import with_cameras
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from psotrack.geometry import make_camera, make_rig
-from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
+from psotrack.recordings import FrameTimes, make_timeline
 
 # --- frames at instants
 
@@ -119,33 +116,11 @@ def test_timelines_by_hand(times, rate_hz, frame, offset_s):
 # --- what belongs together
 
 
-NAMES = ("a", "b", "c", "d", "e")
-
-
-def make_recording(**changes) -> Recording:
-    """Make a recording of five equal cameras.
-
-    Args:
-        changes: Camera name -> fields of its `VideoInfo` that differ; None removes the camera's video.
-    """
-    videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, (1920, 1080)) for name in NAMES}
-    for name, change in changes.items():
-        if change is None:
-            del videos[name]
-        else:
-            videos[name] = replace(videos[name], **change)
-    K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
-    rig = make_rig(
-        {name: make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=(1920, 1080)) for name in NAMES}
-    )
-    return Recording("S01", Path("S01"), cameras_of(rig, video=videos))
-
-
 def test_cameras_are_chosen_by_their_names():
     # Rates that differ by rounding are equal.
-    recording = make_recording(c={"fps": 25.00004})
+    recording = full_hd_recording(c={"fps": 25.00004})
     usable = recording.usable()
-    assert usable.rig.names == tuple(usable.videos) == NAMES
+    assert usable.rig.names == tuple(usable.videos) == LETTERS
     assert usable.num_frames == 250
     assert usable.fps == pytest.approx(25.0, abs=1e-4)
     chosen = recording.usable(["d", "b"])
@@ -154,7 +129,7 @@ def test_cameras_are_chosen_by_their_names():
 
 
 def test_a_camera_without_video_is_left_out_with_a_warning(caplog):
-    recording = make_recording(b=None, d=None)
+    recording = full_hd_recording(b=None, d=None)
     usable = recording.usable()
     assert usable.rig.names == tuple(usable.videos) == ("a", "c", "e")
     assert caplog.messages == [f"camera {name} is left out: it has no video" for name in "bd"]
@@ -164,18 +139,18 @@ def test_a_camera_without_video_is_left_out_with_a_warning(caplog):
     assert timed.usable(videos=False).rig.names == ("a", "b", "c", "e")
     assert timed.usable(videos=False).num_frames == 250
     assert timed.usable(["b"], videos=False).num_frames == 30
-    assert make_recording(**dict.fromkeys(NAMES)).num_frames == 0
+    assert full_hd_recording(**dict.fromkeys(LETTERS)).num_frames == 0
 
 
 def test_cameras_may_differ_in_size_rate_and_length():
-    recording = make_recording(
+    recording = full_hd_recording(
         a={"num_frames": 100},
         b={"fps": 50.0, "num_frames": 400},
         c={"image_size_wh": (1280, 720)},
     )
     recording.cameras[2].camera.image_size_wh[:] = (1280, 720)
     usable = recording.usable()
-    assert (usable.rig.names, usable.fps) == (NAMES, 50.0)
+    assert (usable.rig.names, usable.fps) == (LETTERS, 50.0)
     # The cameras at 25 frames per second last 10 s, the fast one 8 s.
     timeline = usable.timeline()
     assert usable.num_frames == timeline.num_instants == 500
@@ -184,7 +159,7 @@ def test_cameras_may_differ_in_size_rate_and_length():
 
 def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
     recording = with_cameras(
-        make_recording(b={"fps": 50.0}),
+        full_hd_recording(b={"fps": 50.0}),
         times={"c": FrameTimes(250, 25.0, 0.8), "d": FrameTimes(250, 25.0, 3.0)},
     ).usable(num_frames=100)
     # 100 instants at 50 Hz are 2 s.
@@ -193,5 +168,5 @@ def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
     assert {each.name: each.times.num_frames for each in recording.cameras} == counts
     assert recording.num_frames == 100
     assert "camera d is left out: it has no frame before instant 100" in caplog.text
-    shorter = make_recording(c={"num_frames": 240}).usable(num_frames=240)
+    shorter = full_hd_recording(c={"num_frames": 240}).usable(num_frames=240)
     assert {video.num_frames for video in shorter.videos.values()} == {240}
