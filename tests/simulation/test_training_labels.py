@@ -18,11 +18,10 @@ from scipy.spatial.transform import Rotation
 from worlds import CAMERAS, NUM_FRAMES, two_flights
 
 from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
-from psotrack.geometry import look_at, make_camera, make_rig, project
-from psotrack.geometry.rig_files import write_rig
-from psotrack.recordings import Reference, VideoWriter, read_frames
+from psotrack.geometry import look_at, make_camera, project
+from psotrack.recordings import FrameTimes, Reference, read_frames
 from psotrack.recordings.datasets import open_recording
-from psotrack.trajectories import Trajectories, write_trajectories
+from psotrack.trajectories import Trajectories
 
 #: A distant camera at y = -1000 m with 100 x 80 pixels and 10 pixels per metre; x is to the right, z is up.
 FAR = far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)
@@ -200,6 +199,12 @@ def load_data_set(out):
     return found
 
 
+def corners_px(rows):
+    """The boxes (labels, 4) of rows of a file of labels, pixels."""
+    middle, size = rows[:, 1:3], rows[:, 3:]
+    return np.hstack([middle - size / 2, middle + size / 2]) * [320, 240, 320, 240]
+
+
 def test_the_data_set_can_be_loaded_by_a_trainer(flights, run_labels, tmp_path):
     out = tmp_path / "set"
     result = run_labels(("flight", "second"), "--out", out, "--json", "-")
@@ -217,10 +222,8 @@ def test_the_data_set_can_be_loaded_by_a_trainer(flights, run_labels, tmp_path):
                 image = out / "images" / part / f"{name}_{camera}_{frame:06d}.jpg"
                 expected = boxes[frame, :, index]
                 expected = expected[np.isfinite(expected).all(axis=-1)]
-                middle, size = found[part, image][:, 1:3], found[part, image][:, 3:]
-                corners = np.hstack([middle - size / 2, middle + size / 2]) * [320, 240, 320, 240]
                 # The file holds shares of 320 pixels with six decimals.
-                np.testing.assert_allclose(corners, expected, atol=5e-4)
+                np.testing.assert_allclose(corners_px(found[part, image]), expected, atol=5e-4)
                 # The limit is above the error of JPEG at quality 95; the noise of another frame differs more.
                 assert np.abs(cv2.imread(str(image)).astype(int) - shown).mean() < 2.0
     # An offset of one kilometre moves all drones out of all images: their label files are empty.
@@ -271,35 +274,24 @@ def test_recordings_without_poses_or_frames_leave_nothing_behind(flights, tmp_pa
         )
 
 
-def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
-    """A drone flies to the right at 1 m/s, 5 m before two cameras with frames between the instants.
+def test_frames_of_cameras_with_rates_and_starts_of_their_own(flights, tmp_path):
+    """Drones fly at 1 m/s along y, and frames are between the instants of the reference.
 
     Frames before the first instant, whose pose is not known, are left out.
     """
-    R, t_m = look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    K = np.array([[100.0, 0, 99.5], [0, 100, 49.5], [0, 0, 1]])
-    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(200, 100))
-    starts_s, rates_hz = {"slow": 0.03, "quick": 0.0}, {"slow": 25.0, "quick": 50.0}
-    time_s = 0.05 + np.arange(60) / 100
-    position_m = np.stack([time_s, np.full(60, 5.0), np.zeros(60)], axis=-1)[:, None]
-    write_rig(tmp_path / "rig.toml", make_rig(dict.fromkeys(starts_s, camera)))
-    write_trajectories(tmp_path / "drone.csv", Trajectories(np.arange(60), time_s, ("drone",), position_m))
-    tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.csv"]']
-    for name, start_s in starts_s.items():
-        with VideoWriter(tmp_path / f"{name}.avi", rates_hz[name], (200, 100)) as video:
-            for _ in range(int(rates_hz[name] // 5)):
-                video.write(np.zeros((100, 200, 3), np.uint8))
-        tables.append(f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {start_s}')
-    (tmp_path / "recording.toml").write_text("\n".join(tables))
-    recording = open_recording(tmp_path)
-    small = LabelSettings(drone_size_m=(0.1, 0.1, 0.1))
-    write_data_set([recording, replace(recording, name="again")], tmp_path / "set", small, jobs=1)
-    for name, start_s in starts_s.items():
-        files = sorted((tmp_path / "set" / "labels").glob(f"*/*_{name}_*.txt"))
-        known = [k for k in range(int(rates_hz[name] // 5)) if start_s + k / rates_hz[name] > 0.05]
-        assert sorted(int(file.stem[-6:]) for file in files) == sorted(2 * known)
-        for file in files:
-            middle_px = 200 * float(file.read_text().split()[1])
-            time_s = start_s + int(file.stem[-6:]) / rates_hz[name]
-            # The near and the far side of the cube, 0.1 m apart, shift the middle by up to 0.02 px.
-            assert middle_px == pytest.approx(100 + 100 * time_s / 5, abs=0.03)
+    first, second = (open_recording(flights / name) for name in ("flight", "second"))
+    times = {"c0": FrameTimes(NUM_FRAMES, 25.0, -0.05), "c1": FrameTimes(NUM_FRAMES, 50.0, 0.013)}
+    chosen = LabelSettings(SIZE_M)
+    write_data_set([with_cameras(first, times=times), second], tmp_path / "set", chosen, jobs=1)
+    found = {image.stem: rows for (_, image), rows in load_data_set(tmp_path / "set").items()}
+    for index, (name, own) in enumerate(times.items()):
+        time_s = own.time_offset_s + np.arange(NUM_FRAMES) / own.fps
+        known = np.flatnonzero(time_s > 0)
+        stems = [f"flight_{name}_{frame:06d}" for frame in known]
+        assert sorted(stem for stem in found if stem.startswith(f"flight_{name}_")) == stems
+        position_m = first.truth.position_m[0] + time_s[known, None, None] * [0.0, 1.0, 0.0]
+        boxes = labels_in_rig(first.rig, make_reference(position_m), chosen)[:, :, index]
+        for stem, expected in zip(stems, boxes, strict=True):
+            expected = expected[np.isfinite(expected).all(axis=-1)]
+            # The file holds shares of 320 pixels with six decimals.
+            np.testing.assert_allclose(corners_px(found[stem]), expected, atol=5e-4)

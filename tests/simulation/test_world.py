@@ -236,15 +236,10 @@ def test_41_markers_are_on_the_walls_and_face_inwards(hall_name):
             assert gap_m > 0.4 * hall.marker_size_m, "sheets overlap"
 
 
-def test_rooms_are_deterministic_and_markers_change_no_wall():
+def test_markers_change_no_wall():
     plain, marked = (rooms.room("laboratory", markers, 0.1) for markers in (False, True))
     assert plain.marker_corners_m == {}
     assert len(marked.surfaces) == len(plain.surfaces) + 41
-    rooms.room.cache_clear()
-    again = rooms.room("laboratory", True, 0.1)
-    assert again is not marked
-    for first, second in zip(marked.surfaces, again.surfaces, strict=True):
-        np.testing.assert_array_equal(first.texture, second.texture)
     for first, second in zip(plain.surfaces[:6], marked.surfaces[:6], strict=True):
         np.testing.assert_array_equal(first.texture, second.texture)
 
