@@ -217,8 +217,6 @@ def test_exported_tracks_beside_a_file_are_no_record(tmp_path):
 
 #: Name of a file of tracks that `place` makes -> the record beside it.
 RECORDS = {
-    "no_json": "{",
-    "a_list": "[1]",
     "other_types": '{"encounters": 3}',
     "of_a_barn": '{"sequence": "barn"}',
     "longer": "{}",
@@ -230,8 +228,6 @@ BAD = {
         "flight: expected a file of tracks, found a recording; name the recording last"
     ],
     "report {tracks} --out x.pdf": ["ends in .html"],
-    "report no_json.csv": ["no_json.json: expected the record of a run, ", "found an error"],
-    "report a_list.csv": ["a_list.json: expected the record of a run, ", "found JSON with a list"],
     "report other_types.csv": ["other_types.json, encounters: expected a list"],
     "report of_a_barn.csv {flight}": ["expected tracks of flight, found tracks of barn"],
     "report longer.csv {flight}": ["from 0.00 to 0.52 s, as in flight, found 0.00 to 5.20 s"],
