@@ -2,10 +2,8 @@
 wrong maps, by which every frame is lost or right while the wrong markers are named."""
 
 import json
+import os
 import signal
-import subprocess
-import sys
-import textwrap
 import threading
 from itertools import combinations
 
@@ -45,7 +43,6 @@ from psotrack.inside_out.localising import frame_poses, localise_frames
 from psotrack.recordings.datasets import write_marker_corners
 from psotrack.trajectories import Status
 
-LENS = DRAWN_LENS
 TRUTH_M = np.array([camera.centre_world for camera in drawn_cameras()])
 #: The frames that show less than four markers, and the others.
 BLIND = [FEW_MARKERS_FRAME, NO_MARKERS_FRAME]
@@ -186,10 +183,10 @@ def test_a_sequence_provides_markers_and_intrinsics(run_psotrack, localise, draw
 
 
 def test_the_edges_of_an_image_stay_where_a_lens_is_scaled():
-    large = scale_lens(LENS, (1920, 1440))
+    large = scale_lens(DRAWN_LENS, (1920, 1440))
     points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (20, 3))
     # The edges of the image, half a pixel beyond the centres of the outer pixels, do not move.
-    small_px, large_px = project(LENS, points)[0], project(large, points)[0]
+    small_px, large_px = project(DRAWN_LENS, points)[0], project(large, points)[0]
     np.testing.assert_allclose(large_px + 0.5, 3 * (small_px + 0.5), rtol=1e-12)
 
 
@@ -279,7 +276,9 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_its_frames(localise, drawn, monkeyp
 def test_a_stream_that_ends_is_not_interrupted(drawn, monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: Capture(first_images(drawn)))
     marker_map = read_marker_map(drawn / "corners.csv")
-    found = localise_video(open_source("rtsp://camera/1"), marker_map, LENS, LocaliseSettings(filter=None))
+    found = localise_video(
+        open_source("rtsp://camera/1"), marker_map, DRAWN_LENS, LocaliseSettings(filter=None)
+    )
     assert found.path.num_frames == FEW_MARKERS_FRAME
     assert not found.interrupted
     # Without timestamps, the times of arrival are used.
@@ -315,34 +314,28 @@ def test_newest_items_are_used_and_the_last_is_never_left_out():
 
 
 def test_ctrl_c_ends_the_wait_for_an_item_though_another_thread_received_the_signal():
-    program = """
-        import signal, threading, time
-        from psotrack.inside_out.frames import read_ahead
+    """The kernel gives the signal to `other`, because the main thread and the reader block it."""
+    interrupted, too_late = threading.Event(), threading.Event()
 
-        # A test run in the background ignores SIGINT, and its children inherit this.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        # The kernel gives the signal to this thread, because the main thread and the reader block the signal.
-        threading.Thread(target=time.sleep, args=(300,), daemon=True).start()
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    def frames():
+        os.kill(os.getpid(), signal.SIGINT)
+        if not interrupted.wait(120):
+            too_late.set()
+        yield 0
 
-        def frames():
-            print("reading", flush=True)
-            time.sleep(300)
-            yield 0
-
-        list(read_ahead(frames()))
-    """
-    words = [sys.executable, "-c", textwrap.dedent(program)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
-        try:
-            assert child.stdout.readline() == "reading\n"
-            child.send_signal(signal.SIGINT)
-            # Without the signal the child would sleep for 300 s.
-            _, stderr = child.communicate(timeout=120)
-        finally:
-            child.kill()
-    assert child.returncode == -signal.SIGINT
-    assert stderr.endswith("KeyboardInterrupt\n")
+    other = threading.Thread(target=interrupted.wait, daemon=True)
+    other.start()
+    # A test run in the background ignores SIGINT.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            list(read_ahead(frames()))
+        assert not too_late.is_set()
+    finally:
+        interrupted.set()
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, before)
 
 
 # Wrong maps, and markers turned any way.
