@@ -107,7 +107,6 @@ USUAL = {
     "inside_m": INSIDE_M,
     "inside_stated": 1.0,
     "inside_part": 0.5,
-    "outside_stated": 1.0,
     "outside_part": 1.0,
     "outside_s": 0.3,
 }
@@ -136,8 +135,8 @@ def fly_twice_seen(seed, num_frames=150, num_drones=1, *, distance_m=4.0, **give
         middles.append(position_m + rotation.apply(ARM_M) + outside_m)
         truths.append((position_m, rotation))
     middle_m = np.stack(middles, axis=1)
-    stated_m2 = np.diag((given["outside_stated"] * OUTSIDE_M) ** 2)
-    return paths, outside_tracks(middle_m, np.tile(stated_m2, (*middle_m.shape[:2], 1, 1))), truths
+    stated_m2 = np.tile(np.diag(OUTSIDE_M**2), (*middle_m.shape[:2], 1, 1))
+    return paths, outside_tracks(middle_m, stated_m2), truths
 
 
 def fly_with_a_swap():

@@ -86,7 +86,8 @@ def test_corners_are_found_at_their_drawn_positions(changes, limits_px):
     [
         # Measured 0.09 at most; a fixed gamma of 2 gives 1.5 pixels in blurred grey images.
         ({"blur_px": 2.5}, 0.15),
-        ({"moved_px": 9}, 0.15),
+        # The search for an edge must reach as far as the blur: four pixels would miss most of this transition.
+        ({"moved_px": 15}, 0.15),
         # Blurred and clipped images have wide white areas, as with a high power. Uncorrected errors are 0.3 to 1.0.
         ({"blur_px": 2.0, "gain": 1.2}, 0.12),
     ],
@@ -95,12 +96,6 @@ def test_corners_are_found_at_their_drawn_positions(changes, limits_px):
 def test_corners_are_right_for_every_gamma(changes, limit_px, exponent):
     """Renderers blend grey levels, cameras blend light."""
     assert errors_px(*scene(exponent=exponent, **changes)).max() < limit_px
-
-
-def test_a_blur_of_most_of_a_cell_moves_no_corner():
-    """The search for an edge must reach as far as the blur: four pixels would miss most of this transition."""
-    # Measured 0.07.
-    assert errors_px(*scene(moved_px=15)).max() < 0.15
 
 
 def test_a_second_blur_and_compression_move_corners_little():

@@ -36,7 +36,6 @@ from psotrack.inside_out import (
     build_map,
     check_map,
     corners_in_own_frame,
-    fit_squares,
     fuse,
     open_source,
     read_camera_path,
@@ -139,10 +138,6 @@ def opens_folder_that_is_not_readable(folder, run):
     return call
 
 
-def read_squares(path):
-    return fit_squares(read_measured_corners(path))
-
-
 def third(corners):
     """The table of the room with other corners of marker 3, in line 4."""
     return wide_table({**ROOM, 3: corners})
@@ -219,7 +214,6 @@ BAD = {
     "no markers": (calls(MarkerMap, {}), "at least one marker"),
     "centre twice": (reads(CENTRES_TWICE, read_marker_table), "line 3, column id", "once, found 3 again"),
     "same centre": (reads(SAME_CENTRE, read_marker_table), "centre of marker 3 for marker 4 as well"),
-    "measured, no square": (reads(third(bent(0.15, 0)), read_squares), "line 4, marker 3", "a flat square"),
     "unseen corner": (reads_c3d(CORNERS_OF_3, UNSEEN_M), "room.c3d, marker 3: ", "number 2 is never seen"),
     "labels of drones": (reads_c3d(("Dron1:Dron11",), np.ones((5, 1, 3))), "Marker7:1", "found Dron1"),
     # Maps from videos and from centres.
