@@ -171,16 +171,14 @@ def test_what_each_format_keeps(tmp_path):
     np.testing.assert_array_equal(read_tracks(tmp_path, recording=instants(NUM_FRAMES)).seen, seen)
 
 
-def figures(run_psotrack, tracks, flight):
-    return json.loads(run_psotrack("evaluate", tracks, flight, "--json", "-").out)
-
-
 @pytest.mark.parametrize("to", ["mot", "mcap"])
 def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tracks_file, tmp_path, to):
     """The same figures, except those of covariances that the format does not hold."""
     out = tmp_path / ("mot" if to == "mot" else "tracks.mcap")
     assert run_psotrack("export", tracks_file, flight, "--to", to, "--out", out).code == 0
-    expected, found = (figures(run_psotrack, path, flight) for path in (tracks_file, out))
+    expected, found = (
+        json.loads(run_psotrack("evaluate", path, flight, "--json", "-").out) for path in (tracks_file, out)
+    )
     assert expected["missed_rate"] > 0.1, "the gaps count"
     del expected["per_drone"]
     for key, value in expected.items():
