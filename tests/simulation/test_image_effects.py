@@ -124,21 +124,6 @@ def test_motion_blur_is_as_long_as_the_motion_during_the_exposure():
 # --- the floor as a mirror
 
 
-def test_fresnel_agrees_with_glass():
-    """The oracle is Fresnel's equations for unpolarised light; an index of 1.5 reflects 4 % at normal incidence."""
-    index = 1.5
-    cosine = np.linspace(0, 1, 50)
-    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
-    across = (cosine - index * inside) / (cosine + index * inside)
-    along = (inside - index * cosine) / (inside + index * cosine)
-    exact = (across**2 + along**2) / 2
-    schlick = reflections.fresnel(cosine, 0.04)
-    assert schlick[-1] == pytest.approx(0.04)
-    assert schlick[0] == pytest.approx(1.0)
-    # Schlick's formula is an approximation; the largest measured error is 0.03.
-    np.testing.assert_allclose(schlick, exact, atol=0.04)
-
-
 def test_the_floor_mirrors_more_where_it_is_seen_at_a_lower_angle():
     renderer = make_renderer(reflections=0.1)
     eye = -renderer.cam.R.T @ renderer.cam.t_m

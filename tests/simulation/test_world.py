@@ -55,21 +55,6 @@ def test_a_model_is_closed_and_has_its_stated_sizes(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_rotors_turn_above_their_motors_without_touching_each_other(name):
-    model = MODELS[name]
-    vertices = model.triangles_m.reshape(-1, 3)
-    rotors = list(zip(model.rotor_centres_m, model.rotor_radii_m, strict=True))
-    for hub, radius in rotors:
-        # The rotor's cap is a cylinder with a radius of 6 mm around the rotor's centre.
-        assert np.linalg.norm(vertices - hub, axis=-1).min() < 0.008
-        aside = np.linalg.norm(vertices[:, :2] - hub[:2], axis=-1)
-        swept = vertices[(aside < radius) & (aside >= 0.02), 2]
-        assert np.abs(swept - hub[2]).min(initial=np.inf) > 0.003
-    for (a, r), (b, s) in itertools.combinations(rotors, 2):
-        assert np.linalg.norm(a - b) > r + s or abs(a[2] - b[2]) > 0.01
-
-
-@pytest.mark.parametrize("name", MODELS)
 def test_marker_crosses_stand_on_top_are_asymmetric_and_differ_between_ten_drones(name):
     model = MODELS[name]
     crosses = [drones.marker_cross(model, number) for number in range(1, 11)]
