@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from board_rigs import HELD, draw_board, draw_sheet, film_board, random_poses
+from board_rigs import HELD, HELD_K, draw_board, draw_sheet, film_board, random_poses
 from real_data import published
 from scipy.spatial.transform import Rotation
 
@@ -31,22 +31,16 @@ from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings.datasets import open_recording
 
 SIZE_WH = (640, 480)
-K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
-BOARD = Board((4, 6), 0.04, 0.03)
 CHESS = Board((6, 5), 0.03, kind="chessboard")
 
 
-def pose(seed=0):
-    rng = np.random.default_rng(seed)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
-    T[:3, 3] = np.array([-0.08, -0.12, 0.45]) + rng.uniform(-0.02, 0.02, 3)
-    return T
+#: The board before the camera.
+POSES = list(random_poses(16))
 
 
 def projected(board, T):
     points = board.corners_m @ T[:3, :3].T + T[:3, 3]
-    return points[:, :2] / points[:, 2:] * np.diag(K)[:2] + K[:2, 2]
+    return points[:, :2] / points[:, 2:] * np.diag(HELD_K)[:2] + HELD_K[:2, 2]
 
 
 def draw_grid(board, T):
@@ -60,35 +54,36 @@ def draw_grid(board, T):
         top, left = place // columns * pitch, place % columns * pitch
         marker = cv2.aruco.generateImageMarker(dictionary, board.first_marker + place, side)
         sheet[top : top + side, left : left + side] = marker
-    return draw_sheet(np.pad(sheet, 30, constant_values=255), 30, per_m, K, T, SIZE_WH)
+    return draw_sheet(np.pad(sheet, 30, constant_values=255), 30, per_m, HELD_K, T, SIZE_WH)
 
 
 def draw_chess(T):
     """Grey image of the chessboard, with a white border."""
     sheet = np.kron(np.add.outer(np.arange(5), np.arange(6)) % 2, np.ones((75, 75))) * 255
-    return draw_sheet(np.pad(sheet.astype(np.uint8), 60, constant_values=255), 60, 2500.0, K, T, SIZE_WH)
+    return draw_sheet(np.pad(sheet.astype(np.uint8), 60, constant_values=255), 60, 2500.0, HELD_K, T, SIZE_WH)
 
 
-def drawn(count, board=BOARD):
-    return [draw_board(board, K, pose(seed), SIZE_WH) for seed in range(count)]
+def drawn(count, board=HELD):
+    return [draw_board(board, HELD_K, T, SIZE_WH) for T in POSES[:count]]
 
 
 def test_corners_of_a_board_seen_from_both_sides():
     (image,) = drawn(1)
-    assert np.abs(BoardFinder(BOARD).find(image) - projected(BOARD, pose())).max() < 0.5
+    assert np.abs(BoardFinder(HELD).find(image) - projected(HELD, POSES[0])).max() < 0.5
     # From behind, or in a mirror: the same corners at the pixels where they are.
-    mirrored = BoardFinder(BOARD).find_mirrored(np.ascontiguousarray(image[:, ::-1]))
-    expected = projected(BOARD, pose()) * [-1, 1] + [SIZE_WH[0] - 1, 0]
+    mirrored = BoardFinder(HELD).find_mirrored(np.ascontiguousarray(image[:, ::-1]))
+    expected = projected(HELD, POSES[0]) * [-1, 1] + [SIZE_WH[0] - 1, 0]
     assert np.abs(mirrored - expected).max() < 0.5
 
 
 def test_corners_of_a_grid_and_of_a_chessboard():
     grid = Board((3, 4), 0.045, 0.036, "apriltag_36h11", "grid", first_marker=5)
-    assert np.abs(BoardFinder(grid).find(draw_grid(grid, pose())) - projected(grid, pose())).max() < 0.6
+    pose = POSES[1]
+    assert np.abs(BoardFinder(grid).find(draw_grid(grid, pose)) - projected(grid, pose)).max() < 0.6
     # Turned by half a turn, the corners keep their numbers: the square between the first four is dark.
-    middle_m = pose(1)[:3, 3] + 0.05 + pose(1)[:3, :3] @ [0.09, 0.075, 0]
+    middle_m = pose[:3, 3] + 0.05 + pose[:3, :3] @ [0.09, 0.075, 0]
     for turn in (0.0, 180.0):
-        T = pose(1)
+        T = pose.copy()
         T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
         T[:3, 3] = middle_m - T[:3, :3] @ [0.09, 0.075, 0]
         assert np.abs(BoardFinder(CHESS).find(draw_chess(T)) - projected(CHESS, T)).max() < 0.6
@@ -109,15 +104,15 @@ def test_a_board_is_drawn_in_its_true_size(tmp_path):
 @pytest.mark.parametrize(
     ("printed", "inverted"),
     [
-        pytest.param(BOARD, False, marks=pytest.mark.slow),
-        (BOARD, True),
+        pytest.param(HELD, False, marks=pytest.mark.slow),
+        (HELD, True),
         pytest.param(Board((5, 4), 0.05, 0.027, "5x5_100"), False, marks=pytest.mark.slow),
         (CHESS, False),
     ],
     ids=["charuco", "white on black", "small markers", "chessboard"],
 )
 def test_what_a_board_is_follows_from_images_and_the_side_of_a_square(printed, inverted):
-    images = [draw_chess(pose(seed)) for seed in range(3)] if printed is CHESS else drawn(3, printed)
+    images = [draw_chess(POSES[seed]) for seed in range(3)] if printed is CHESS else drawn(3, printed)
     found = detect_board(printed.square_m, [255 - image if inverted else image for image in images])
     assert (found.squares_wh, found.kind) == (printed.squares_wh, printed.kind)
     if printed.marker_m is not None:
@@ -130,24 +125,23 @@ def test_what_a_board_is_follows_from_images_and_the_side_of_a_square(printed, i
 def test_the_pattern_is_found_out_in_both_prints(inverted, legacy):
     printed = Board((4, 6), 0.04, 0.03, legacy=legacy)
     images = [255 - image if inverted else image for image in drawn(2, printed)]
-    assert recognise_board(BOARD, images) == (printed, 2)
+    assert recognise_board(Board((4, 6), 0.04, 0.03), images) == (printed, 2)
 
 
-SHOWN = "found a ChArUco board of 4 x 6 squares of 40 mm with markers of"
+SHOWN = "found a ChArUco board of 7 x 5 squares of 40 mm with markers of"
 
 
 @pytest.mark.parametrize(
     ("stated", "words"),
     [
-        (Board((6, 4), 0.04, 0.03, "5x5_50"), (SHOWN, "pass --squares 4x6 --dictionary 4x4_50")),
+        (Board((5, 7), 0.04, 0.03, "5x5_50"), (SHOWN, "pass --squares 7x5 --dictionary 4x4_50")),
         pytest.param(
-            Board((4, 6), 0.04, kind="chessboard"),
-            (SHOWN, "pass --squares 4x6 --marker 0.0"),
+            Board((7, 5), 0.04, kind="chessboard"),
+            (SHOWN, "pass --squares 7x5 --marker 0.0"),
             marks=pytest.mark.slow,
         ),
-        pytest.param(Board((4, 3), 0.04, 0.03, kind="grid"), (SHOWN,), marks=pytest.mark.slow),
         pytest.param(
-            Board((4, 6), 0.04, 0.03, "4x4_100"), ("found too few of its corners",), marks=pytest.mark.slow
+            Board((7, 5), 0.04, 0.03, "4x4_100"), ("found too few of its corners",), marks=pytest.mark.slow
         ),
     ],
 )
@@ -160,7 +154,7 @@ def test_another_board_is_named(stated, words):
 def test_another_grid_is_named():
     shown = Board((2, 2), 0.05, 0.04, "apriltag_36h11", "grid", first_marker=20)
     stated = Board((2, 2), 0.05, 0.04, "apriltag_36h11", "grid")
-    message = str(missing_board(stated, [draw_grid(shown, pose())]))
+    message = str(missing_board(stated, [draw_grid(shown, POSES[1])]))
     assert "found markers 20 to 23 of the dictionary apriltag_36h11" in message
     assert "--first-marker" in message
 
@@ -168,8 +162,8 @@ def test_another_grid_is_named():
 @pytest.mark.slow
 def test_markers_that_stand_still_are_not_those_of_the_board():
     """As many markers as on the board are on the walls, which each of five cameras sees at other pixels."""
-    walls = Board((4, 6), 0.04, 0.03, "6x6_250")
-    on_walls = [draw_board(walls, K, pose(10 + camera), SIZE_WH) for camera in range(5)]
+    walls = Board((7, 5), 0.04, 0.03, "6x6_250")
+    on_walls = [draw_board(walls, HELD_K, POSES[10 + camera], SIZE_WH) for camera in range(5)]
     images = [np.hstack([board, wall]) for board in drawn(2) for wall in on_walls]
     assert detect_board(0.04, images).dictionary == "4x4_50"
     # What stands still counts where nothing else is found.
@@ -177,7 +171,7 @@ def test_markers_that_stand_still_are_not_those_of_the_board():
 
 
 def test_the_size_of_the_markers_is_measured():
-    images, stated = drawn(3), Board((4, 6), 0.04, 0.016)
+    images, stated = drawn(3), Board((7, 5), 0.04, 0.016)
     for shown in (images, [255 - image for image in images]):
         assert measure_markers(stated, shown) == pytest.approx(0.75, rel=0.05)
     assert measure_markers(stated, images[:2]) is None
@@ -205,7 +199,7 @@ def test_cameras_of_a_recording_need_no_place(tmp_path):
     """A camera that is new in the rig is calibrated with those that have a place already."""
     for name in ("old", "new"):
         film_board(tmp_path / f"{name}.avi", random_poses(3))
-    placed = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)
+    placed = make_camera(R=np.eye(3), t_m=np.zeros(3), K=HELD_K, image_size_wh=SIZE_WH)
     write_rig(tmp_path / "rig.toml", make_rig({"old": placed}))
     cameras = "".join(f'[cameras.{name}]\nvideo = "{name}.avi"\n' for name in ("old", "new"))
     (tmp_path / "recording.toml").write_text(f'version = 1\ncalibration = "rig.toml"\n{cameras}')
@@ -278,8 +272,6 @@ def test_a_lens_from_a_board(tmp_path):
 #: Name of the model -> focal length in pixels, and OpenCV's coefficients, of lenses with strong distortion.
 STRONG_LENSES = {
     "5": (700.0, (-0.2, 0.05, 0.001, 0.0005, 0.0)),
-    "8": (520.0, (0.9, -0.12, 0.0008, -0.0006, 0.02, 1.25, -0.05, 0.03)),
-    "12": (650.0, (-0.25, 0.09, 5e-4, -7e-4, -0.01, 0.05, 0.02, 0.01, 0.012, -0.006, 0.009, 0.004)),
     "14": (650.0, (-0.25, 0.09, 5e-4, -7e-4, -0.01, 0.05, 0.02, 0.01, 4e-3, -2e-3, 3e-3, 1e-3, 0.06, -0.04)),
     "fisheye": (330.0, (0.06, -0.03, 0.012, -0.003)),
 }

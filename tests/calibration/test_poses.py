@@ -10,12 +10,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.calibration import (
-    inflation,
     locate_camera,
     ray_distances,
     solve_pnp,
     solve_pnp_ransac,
-    spread_px,
 )
 from psotrack.geometry import look_at, make_camera, project
 
@@ -152,18 +150,6 @@ def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
     # Relative to variances of 1e-5 m².
     turned_m2 = R @ here.centre_covariance_m2 @ R.T
     np.testing.assert_allclose(there.centre_covariance_m2, turned_m2, rtol=0, atol=1e-8)
-
-
-def test_spread_and_inflation():
-    rng = np.random.default_rng(10)
-    distance = np.linalg.norm(rng.normal(0, 2.0, (20001, 2)), axis=1)
-    # A median of 20,000 values has an error of 1 %.
-    assert spread_px(distance, 0) == pytest.approx(2.0, rel=0.03)
-    assert spread_px(distance, 20001) == pytest.approx(2.0 * np.sqrt(2), rel=0.03)
-    assert spread_px(np.ones(3), 6) == 0.0
-    assert inflation(24.0, 18) == 1.0
-    assert inflation(180.0, 18) == 10.0
-    assert inflation(5.0, 0) == 1.0
 
 
 # OpenCV's solvers.

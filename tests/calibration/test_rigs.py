@@ -153,28 +153,17 @@ def test_false_corners_do_not_matter():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("squares_wh", [(9, 7), pytest.param((7, 7), marks=pytest.mark.nightly)])
-def test_a_chessboard_that_looks_alike_when_turned(squares_wh):
-    """Each view has its corners in one of the two, or four, orders that look alike."""
-    board, rng = Board(squares_wh, 0.1, kind="chessboard"), np.random.default_rng(3)
+def test_a_chessboard_that_looks_alike_when_turned():
+    """Each view has its corners in one of the two orders that look alike."""
+    board, rng = Board((9, 7), 0.1, kind="chessboard"), np.random.default_rng(3)
     views = views_of(RIG, board, seed=3)
     pixels = views.corners_px.copy()
-    assert len(board.labellings) == (2 if squares_wh == (9, 7) else 4)
+    assert len(board.labellings) == 2
     for camera, instant in np.ndindex(pixels.shape[:2]):
         pixels[camera, instant] = pixels[camera, instant, rng.choice(board.labellings)]
     calibrated = calibrate_rig(board, replace(views, corners_px=pixels))
     assert off_m(calibrated.rig) < 0.02
     assert np.nanmedian(calibrated.residual_px) < 0.4
-
-
-@pytest.mark.parametrize("coefficients", [0, pytest.param(8, marks=pytest.mark.slow)])
-def test_lens_models(coefficients):
-    dist = (0.0,) * 5 if coefficients == 0 else (-0.2, 0.05, 0.001, 0.0005, 0.0)
-    truth = row_of_cameras(2, dist)
-    views = views_of(truth, errors=Errors(0.05), instants=15, seed=7)
-    calibrated = calibrate_rig(BOARD, views, LensChoice(LensModel(coefficients)))
-    assert off_m(calibrated.rig, truth) < 0.01
-    assert np.nanmedian(calibrated.residual_px) < 0.08
 
 
 @pytest.mark.slow
@@ -203,22 +192,11 @@ def test_advice_names_few_shared_views_and_a_video_that_begins_late():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("errors", "seeds"),
-    [
-        (Errors(0.1, view_px=0.3), 3),
-        (Errors(0.1, slip_m=0.003), 3),
-        *(
-            pytest.param(each, 6, marks=pytest.mark.nightly)
-            for each in (Errors(0.2), Errors(0.1, view_px=0.3), Errors(0.1, slip_m=0.003))
-        ),
-    ],
-    ids=str,
-)
-def test_stated_deviations_hold(errors, seeds):
+@pytest.mark.parametrize("errors", [Errors(0.1, view_px=0.3), Errors(0.1, slip_m=0.003)], ids=str)
+def test_stated_deviations_hold(errors):
     """The truth lies within two standard deviations as often as it should, also if corners have errors in common."""
     inside, sizes = [], []
-    for seed in range(seeds):
+    for seed in range(3):
         calibrated = calibrate_rig(BOARD, views_of(errors=errors, instants=30, seed=seed))
         centres, true = calibrated.rig.cameras.centre_world, np.linalg.inv(relative_to_first(RIG))
         for camera in (1, 2):
@@ -230,7 +208,7 @@ def test_stated_deviations_hold(errors, seeds):
             K = calibrated.rig.cameras.K[camera] - RIG.cameras.K[camera]
             inside += (np.abs([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) < 2 * std[:4]).tolist()
     # 95 % for a normal distribution; 18 values of a seed, which depend on each other somewhat.
-    assert np.mean(inside) > (0.86 if seeds == 6 else 0.8)
+    assert np.mean(inside) > 0.8
     assert np.median(sizes) < 0.03
 
 
@@ -251,12 +229,8 @@ def views_at(pixels, rig=FOUR):
     return PointViews(rig.names, np.zeros(len(pixels), np.int64), np.arange(len(pixels)), pixels)
 
 
-def given_world(places):
-    return GivenWorld(Path("world.csv"), {str(name): place for name, place in places.items()}, {})
-
-
 def test_a_moving_point_places_all_cameras():
-    views, points_m, wrong = fly(np.random.default_rng(0))
+    views, _, wrong = fly(np.random.default_rng(0))
     # The last camera joins late: it shares nothing with the first one.
     views.points_px[::2, 0], views.points_px[1::2, 3] = np.nan, np.nan
     found = calibrate_by_point(FOUR, views)
@@ -269,11 +243,6 @@ def test_a_moving_point_places_all_cameras():
     assert found.used[seen & ~wrong].mean() > 0.95
     # The median distance is 1.2 standard deviations, of which a fit takes a part away.
     assert 0.3 < np.median(found.residual_px[found.used]) < 0.8
-    given = given_world({frame: points_m[frame] for frame in range(0, 60, 6)})
-    change, left_m = fit_world(found.rig, given, dict(enumerate(found.points_m)), with_scale=True)
-    assert np.median(list(left_m.values())) < 0.01
-    moved = change.rig(found.rig).cameras.centre_world
-    np.testing.assert_allclose(moved, FOUR.cameras.centre_world, atol=0.03)
 
 
 @pytest.mark.parametrize("late", [0, 20])
@@ -304,7 +273,7 @@ def test_stated_deviations_hold_in_the_world_of_the_point():
         views, points_m, _ = fly(rng, false=0.0)
         views.points_px[:] += np.repeat(rng.normal(0, 1.0, (5, 4, 2)), 12, axis=0)
 
-        given = given_world(dict(enumerate(points_m)))
+        given = GivenWorld(Path("world.csv"), {str(k): place for k, place in enumerate(points_m)}, {})
 
         def world_of(found, given=given):
             numbered = dict(zip(found.views.number.tolist(), found.points_m, strict=True))

@@ -15,13 +15,13 @@ from scipy.spatial.distance import pdist
 from psotrack.calibration import Board, BoardFinder
 from psotrack.errors import InputError
 from psotrack.geometry import project, triangulate_linearly, undistort
-from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
+from psotrack.geometry.rig_files import read_lenses, read_rig
 
 pytestmark = pytest.mark.real
 
 
 @pytest.mark.parametrize("name", ["camera_array.toml", "config.toml"])
-def test_caliscopes_points_are_where_its_cameras_saw_them(tmp_path, name):
+def test_caliscopes_points_are_where_its_cameras_saw_them(name):
     folder = published("mprib/caliscope") / "tests/sessions/4_cam_recording"
     rig = read_rig(folder / name)
     assert rig.names == ("0", "1", "2", "3")
@@ -36,10 +36,6 @@ def test_caliscopes_points_are_where_its_cameras_saw_them(tmp_path, name):
     residual_px = np.linalg.norm(project(rig.cameras, position_m[:, None])[0] - seen, axis=-1)
     # The authors' own medians are 0.35 to 0.65 px; a wrong convention gives hundreds of pixels.
     assert (np.nanmedian(residual_px, axis=0) < 1.0).all()
-    write_rig(tmp_path / "rig.toml", rig)
-    np.testing.assert_allclose(
-        read_rig(tmp_path / "rig.toml").cameras.T_cam_world, rig.cameras.T_cam_world, rtol=0, atol=2e-15
-    )
 
 
 def test_aniposes_cameras_see_the_board_in_one_place():
