@@ -1,22 +1,25 @@
 """Mutation runs: how many faults in the package the tests find. `make mutants` runs this program.
 
 A mutant is the package with one line changed, as Cosmic Ray changes lines. tests/data/mutants.csv holds the mutants, so
-that two versions of the tests meet the same faults; the program that drew them is this file in commit 35fb8eb2. `cover`
-measures which tests execute which lines of the package. `run` then runs, for each mutant, the tests that execute the
-changed line, the quickest first. A mutant is killed if one of them fails or takes far too long. Results are written
-after each mutant, and a second call goes on from there.
+that two versions of the tests meet the same faults; `sample` drew them. `cover` measures which tests execute which
+lines of the package. `run` then runs, for each mutant, the tests that execute the changed line, the quickest first. A
+mutant is killed if one of them fails or takes far too long. Results are written after each mutant, and a second call
+goes on from there.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
+import random
 import shutil
 import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -25,8 +28,76 @@ ROOT = Path(__file__).parents[1]
 MUTANTS = ROOT / "tests" / "data" / "mutants.csv"
 #: Folder of what is measured.
 BUILD = ROOT / "build" / "mutants"
+#: Room -> number of mutants.
+ROOMS = {
+    **{"tracking": 40, "recordings": 32, "inside_out": 32, "calibration": 32, "foreground": 28},
+    **{"simulation": 28, "geometry": 28, "evaluation": 24, "cli": 24, "show": 18, "trajectories": 16},
+    **{"pipeline": 14, "sweeps": 14, "support": 14, "live": 12},
+}
+#: Parts of the names of Cosmic Ray's operators that change types, names or decorators: most of these are no faults.
+LEFT_OUT = ("Decorator", "Variable", "Exception", "BitOr", "BitXor", "RShift", "LShift", "_Is")
 #: Most seconds of the tests, by their own time, that one mutant meets.
 MOST_S = 60.0
+
+
+def sample(seed: int) -> pd.DataFrame:
+    """One mutant per row: room, path, line number, operator, and the line before and after."""
+    from cosmic_ray import plugins
+    from cosmic_ray.ast import ast_nodes, get_ast_from_path
+    from cosmic_ray.mutating import mutate_code
+
+    names = [name for name in plugins.operator_names() if not any(part in name for part in LEFT_OUT)]
+    operators = {name: plugins.get_operator(name)() for name in names}
+    rng, rows = random.Random(seed), []
+    for room, count in ROOMS.items():
+        places: dict[tuple[Any, ...], list[tuple[str, int]]] = defaultdict(list)
+        for path in sorted((ROOT / "psotrack" / room).rglob("*.py")):
+            nodes = list(ast_nodes(get_ast_from_path(path)))
+            lines = lines_of_functions(path.read_text(encoding="utf-8"))
+            for name, operator in operators.items():
+                found = [place for node in nodes for place in operator.mutation_positions(node)]
+                for index, (start, end) in enumerate(found):
+                    if start[0] in lines:
+                        places[path, start, end].append((name, index))
+        order = sorted(places)
+        rng.shuffle(order)
+        drawn = []
+        while len(drawn) < count:
+            place = order.pop()
+            name, index = rng.choice(places[place])
+            code = place[0].read_text(encoding="utf-8")
+            changed = one_changed_line(code, mutate_code(code, operators[name], index))
+            if changed:
+                path = place[0].relative_to(ROOT).as_posix()
+                drawn.append((room, path, changed[0], name.removeprefix("core/"), *changed[1:]))
+        rows += drawn
+    return pd.DataFrame(rows, columns=["room", "path", "line", "operator", "before", "after"])
+
+
+def lines_of_functions(code: str) -> set[int]:
+    """Numbers of the lines within functions, without signatures and docstrings."""
+    inside: set[int] = set()
+    outside: set[int] = set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            documented = ast.get_docstring(node) is not None
+            first = node.body[0].end_lineno + 1 if documented else node.body[0].lineno
+            inside |= set(range(first, node.end_lineno + 1))
+            outside |= set(range(node.lineno, first))
+    return inside - outside
+
+
+def one_changed_line(before: str, after: str | None) -> tuple[int, str, str] | None:
+    """Number and both texts of the only line that differs; None if the program is the same, or none."""
+    if after is None or len(before.splitlines()) != len(after.splitlines()):
+        return None
+    try:
+        same = ast.dump(ast.parse(before)) == ast.dump(ast.parse(after))
+    except SyntaxError:
+        return None
+    pairs = zip(before.splitlines(), after.splitlines(), strict=True)
+    changed = [(number, old, new) for number, (old, new) in enumerate(pairs, 1) if old != new]
+    return changed[0] if len(changed) == 1 and not same else None
 
 
 class Recorder:
@@ -107,7 +178,7 @@ def tests_by_line() -> tuple[dict[tuple[str, int], set[str]], pd.Series]:
 
 
 def chosen_tests(
-    line: tuple[str, int], tests: dict[tuple[str, int], set[str]], seconds: pd.Series
+    line: tuple[str, int | None], tests: dict[tuple[str, int], set[str]], seconds: pd.Series
 ) -> list[str]:
     """Tests that execute the line, then others of their modules, up to `MOST_S` seconds.
 
@@ -132,23 +203,28 @@ def run(results: Path, copy: Path) -> pd.DataFrame:
     for number, mutant in mutants.iterrows():
         if number in done:
             continue
-        chosen = chosen_tests((mutant["path"], mutant["line"]), tests, seconds)
-        outcome = outcome_of(mutant, chosen, copy, limit_s=60 + 5 * seconds[chosen].sum())
+        line = line_of(mutant, (copy / mutant["path"]).read_text(encoding="utf-8"))
+        chosen = chosen_tests((mutant["path"], line), tests, seconds)
+        outcome = {"outcome": "line is gone" if line is None else "not executed", "by": ""}
+        if chosen:
+            outcome = outcome_of(mutant, line, chosen, copy, limit_s=60 + 5 * seconds[chosen].sum())
         row = pd.DataFrame([{"mutant": number, "room": mutant["room"], "tests": len(chosen)} | outcome])
         row.to_csv(results, mode="a", header=not results.exists(), index=False)
     return pd.read_csv(results)
 
 
-def outcome_of(mutant: pd.Series, chosen: list[str], copy: Path, limit_s: float) -> dict[str, str]:
+def line_of(mutant: pd.Series, code: str) -> int | None:
+    """Number of the mutant's line in a file that may have changed since; None if the line is gone."""
+    same = [number for number, line in enumerate(code.split("\n"), 1) if line == mutant["before"]]
+    return min(same, key=lambda number: abs(number - mutant["line"]), default=None)
+
+
+def outcome_of(mutant: pd.Series, line: int, chosen: list[str], copy: Path, limit_s: float) -> dict[str, str]:
     """Whether the tests kill a mutant, and which test does."""
     path = copy / mutant["path"]
     code = path.read_text(encoding="utf-8")
     lines = code.split("\n")
-    if lines[mutant["line"] - 1] != mutant["before"]:
-        return {"outcome": "another line", "by": ""}
-    if not chosen:
-        return {"outcome": "not executed", "by": ""}
-    lines[mutant["line"] - 1] = mutant["after"]
+    lines[line - 1] = mutant["after"]
     path.write_text("\n".join(lines), encoding="utf-8")
     words = ["-x", "-q", "-n", "0", "--tb=line", "-p", "no:cacheprovider", *chosen]
     try:
@@ -165,8 +241,10 @@ def outcome_of(mutant: pd.Series, chosen: list[str], copy: Path, limit_s: float)
         return {"outcome": "killed", "by": f"more than {limit_s:.0f} s"}
     finally:
         path.write_text(code, encoding="utf-8")
-    failed = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return {"outcome": "killed" if done.returncode else "survived", "by": failed[0] if failed else ""}
+    failed = [text.split()[1] for text in done.stdout.splitlines() if text.startswith(("FAILED", "ERROR"))]
+    if bool(failed) != bool(done.returncode):
+        raise RuntimeError(f"expected tests that fail or pass, found:\n{done.stdout[-2000:]}")
+    return {"outcome": "killed" if failed else "survived", "by": failed[0] if failed else ""}
 
 
 def main() -> None:
@@ -175,12 +253,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("sample", help=f"draw mutants into {MUTANTS}").add_argument(
+        "--seed", type=int, default=43
+    )
     commands.add_parser(
         "cover", help="measure which tests execute which lines: as long as all tests, and half more"
     )
     commands.add_parser("run", help="run the mutants that have no result yet: hours")
     arguments = parser.parse_args()
-    if arguments.command == "cover":
+    if arguments.command == "sample":
+        sample(arguments.seed).to_csv(MUTANTS, index=False)
+    elif arguments.command == "cover":
         cover()
     else:
         copy = BUILD / "copy"
