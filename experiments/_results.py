@@ -97,8 +97,17 @@ class Run:
             "command": " ".join(["python", *_portable(sys.argv)]),
             "tracking": tracking_version(),
             "commit": _git("rev-parse", "HEAD") or None,
+            # Figures that were made before this one are no changes of what makes a figure.
             "dirty": [
-                line[3:] for line in _git("status", "--porcelain", "--untracked-files=no").splitlines()
+                line[3:]
+                for line in _git(
+                    "status",
+                    "--porcelain",
+                    "--untracked-files=no",
+                    "--",
+                    ".",
+                    f":!{FOLDER.relative_to(ROOT)}",
+                ).splitlines()
             ],
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }

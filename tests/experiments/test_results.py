@@ -68,8 +68,11 @@ def test_a_record_says_where_its_figures_come_from(results: Run, tmp_path: Path)
     assert record["machine"]["processors"] >= 1
     shown = results("list").out
     assert f"made {record['date'][:10]}, commit {record['commit'][:7]}, version 3 of tracking" in shown
-    script = tmp_path / "experiments" / "speed.py"
-    script.write_text(script.read_text() + "\n# changed\n")
+    git(tmp_path, "add", "-A")
+    git(tmp_path, "commit", "-qm", "figures")
+    for changed in ("speed.py", "results/speed.json"):
+        with (tmp_path / "experiments" / changed).open("a") as file:
+            file.write("\n")
     assert results("make").code == 0
     assert record_of(tmp_path)["dirty"] == ["experiments/speed.py"]
 
