@@ -1,0 +1,49 @@
+"""Thirty-two small cameras, tracked from the videos; two commands make the silhouettes of half of the cameras each."""
+
+import math
+
+import numpy as np
+import pytest
+
+from psotrack.evaluation import evaluate
+from psotrack.pipeline import track_recording
+from psotrack.recordings.datasets import open_recording
+from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
+
+NUM_CAMERAS = 32
+#: The images have 480 x 270 pixels, in which a pixel is 17 mm at a distance of 5 m, where the drones are.
+SCALE, PIXEL_M = 0.25, 0.017
+
+
+@pytest.mark.nightly
+def test_thirty_two_cameras_are_tracked_from_the_videos(tmp_path, run_psotrack):
+    angles = [2 * math.pi * (index + 0.5) / NUM_CAMERAS for index in range(NUM_CAMERAS)]
+    cameras = [
+        {
+            "position_m": [4.7 * math.cos(angle), 3.7 * math.sin(angle), (2.2, 3.2)[index % 2]],
+            "target_m": [0.0, 0.0, 1.3],
+        }
+        for index, angle in enumerate(angles)
+    ]
+    recipe = change_scenario(scenario("S02_D4_A"), {"cameras": cameras})
+    settings = SimulationSettings(scale=SCALE, num_frames=30, masks=False, onboard=False)
+    folder = simulate(recipe, tmp_path, settings)
+    recording = open_recording(folder).usable(num_frames=None)
+    names, cache = recording.rig.names, tmp_path / "cache"
+    assert len(names) == NUM_CAMERAS
+    for half in (names[:16], names[16:]):
+        words = ["detect", folder, "--silhouettes", "--cameras", ",".join(half), "--cache", cache]
+        assert run_psotrack(*words).code == 0
+    tracked = track_recording(recording, cache=cache)
+    # No video was decoded again.
+    assert tracked.record["seconds"]["decode"] == 0
+    errors = evaluate(tracked.trajectories, recording.truth).to_dict()
+    assert errors["drones"] == tracked.trajectories.num_drones == 4
+    assert errors["missed_rate"] == 0
+    # The score sees the middle of a drone's box, which is up to a pixel of these images from the origin of its body.
+    # What is left when this offset of each drone is removed is noise: a silhouette's border is known to about a pixel,
+    # and more than four cameras with independent noise see each drone.
+    assert errors["mean_error_m"] < 1.5 * PIXEL_M
+    assert errors["offset_removed_mean_error_m"] < PIXEL_M / math.sqrt(4)
+    # Cameras on all sides: each drone is seen by most of them.
+    assert np.median(tracked.trajectories.num_cameras) > NUM_CAMERAS / 2
