@@ -97,18 +97,7 @@ class Run:
             "command": " ".join(["python", *_portable(sys.argv)]),
             "tracking": tracking_version(),
             "commit": _git("rev-parse", "HEAD") or None,
-            # Figures that were made before this one are no changes of what makes a figure.
-            "dirty": [
-                line[3:]
-                for line in _git(
-                    "status",
-                    "--porcelain",
-                    "--untracked-files=no",
-                    "--",
-                    ".",
-                    f":!{FOLDER.relative_to(ROOT)}",
-                ).splitlines()
-            ],
+            "dirty": _changed_files(),
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
 
@@ -239,6 +228,13 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.machine()
+
+
+def _changed_files() -> list[str]:
+    """Files with local changes, without the figures: `make results` writes one after the other."""
+    figures_left_out = f":!{FOLDER.relative_to(ROOT)}"
+    status = _git("status", "--porcelain", "--untracked-files=no", "--", ".", figures_left_out)
+    return [line[3:] for line in status.splitlines()]
 
 
 def _git(*words: str) -> str:

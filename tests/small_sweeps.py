@@ -60,7 +60,7 @@ def psotrack(root: Path, *words: object, **more: str) -> subprocess.CompletedPro
 
 
 def wait_until(happened: Callable[[], object]) -> None:
-    """Wait for what another process or thread does, so long that a slow machine fails no test."""
+    """Wait until `happened()` is true; the limit of five minutes is for tests that hang, not for slow machines."""
     end_s = time.monotonic() + 300
     while not happened():
         assert time.monotonic() < end_s

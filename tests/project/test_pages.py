@@ -229,7 +229,7 @@ def test_the_demonstration_ends_with_a_command_that_is_understood(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
     monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
-    # The swarm compiles for longer than it tracks so few frames.
+    # For six frames, compiling the swarm would take longer than everything else.
     monkeypatch.setattr("psotrack.settings.TrackSettings", partial(TrackSettings, method="projection-lines"))
     code, out, _ = run_psotrack("demo", "--out", "demo", "--jobs", "1")
     assert code == 0

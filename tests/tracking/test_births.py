@@ -42,7 +42,7 @@ NUM_FRAMES = 25
 MAX_SPEED_M_S = 3.0
 IMAGE_WH = (240, 180)
 RIG = ring_rig(6, image_size_wh=IMAGE_WH)
-#: A cell of a silhouette is 2 px; at 4 m and focal lengths of 200 px, and of 260 px, that is so much.
+#: Width of a cell of 2 px at a distance of 4 m, for focal lengths of 200 px and of 260 px.
 CELL_M, CELL_5_M = 0.04, 0.03
 SIZE_M = np.array([0.5, 0.5, 0.3])
 
@@ -658,7 +658,7 @@ def tracked_frames(*rows):
 
 
 def lost_in(position_m, velocity_m_s, tracked, *, fps, every=1):
-    """What was lost in the frames of every so many instants."""
+    """The lost drones, where every `every`-th instant has a frame."""
     size_m, instant = np.full((len(tracked[0]), 3), 0.5), every * np.arange(len(tracked))
     return find_lost_tracks(position_m, velocity_m_s, tracked, size_m, instant=instant, fps=fps)
 
