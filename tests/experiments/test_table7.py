@@ -62,13 +62,6 @@ def test_tables_rows_and_a_second_run(run_program: Run, data: Path, tmp_path: Pa
     assert kept.stat().st_mtime_ns == before
 
 
-@pytest.mark.slow
-def test_what_cannot_be_used(run_program: Run, tmp_path: Path) -> None:
-    done = run_program(EXPERIMENT / "table7.py", "--data", tmp_path, "--out", tmp_path / "out")
-    expected = "expected sequences with markers, *_A, in Simulated_Data or Real_Data, found none"
-    assert (done.code, done.err) == (1, f"table7: {tmp_path}: {expected}\n")
-
-
 def test_markers_with_wrong_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXPERIMENT)
     from _sightings import Sightings, mislabelled

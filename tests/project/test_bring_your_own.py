@@ -18,7 +18,7 @@ from psotrack.foreground.silhouettes import ForegroundSettings, find_background
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
 from psotrack.support import identify
-from psotrack.tracking.swarm import camera_weights, find_score, find_search, foreground_and_area
+from psotrack.tracking.swarm import camera_weights, find_search, foreground_and_area
 from psotrack.trajectories import Status, Tracks
 
 pytestmark = pytest.mark.slow
@@ -185,7 +185,8 @@ class CoarseBackground(MedianBackground):
     """Forgets the reduction that the settings ask for."""
 
     def foreground(self, learning, frames):
-        return (mask[::2] for mask in super().foreground(learning, frames))
+        for mask in super().foreground(learning, frames):
+            yield mask[::2]
 
 
 @jax.tree_util.register_static
@@ -206,7 +207,7 @@ def high_dice(settings):
 
 
 def hover(settings):
-    return Hover()
+    return Hover(reads_detections=True)
 
 
 def median(settings):
@@ -221,14 +222,21 @@ def broken(settings):
     return "no detector"
 
 
-#: What an installed package adds: group of entry points -> name of the part and of the function that makes it.
-ENTRY_POINTS = {
-    "searches": {"prediction": "prediction"},
-    "scores": {"high-dice": "high_dice"},
-    "methods": {"hover": "hover"},
-    "backgrounds": {"median": "median", "absent": "no_such_function"},
-    "detectors": {"empty-hall": "empty_hall", "broken": "broken"},
-}
+#: What an installed package adds; the last function is missing.
+ENTRY_POINTS = f"""
+[psotrack.searches]
+prediction = {__name__}:prediction
+[psotrack.scores]
+high-dice = {__name__}:high_dice
+[psotrack.methods]
+hover = {__name__}:hover
+[psotrack.detectors]
+empty-hall = {__name__}:empty_hall
+broken = {__name__}:broken
+[psotrack.backgrounds]
+median = {__name__}:median
+absent = {__name__}:no_such_function
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -238,22 +246,14 @@ def installed(tmp_path_factory, monkeypatch):
     info = site / "own_parts-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-parts\nVersion: 1.0\n")
-    lines = []
-    for group, parts in ENTRY_POINTS.items():
-        lines += [f"[psotrack.{group}]", *(f"{name} = {__name__}:{made}" for name, made in parts.items())]
-    (info / "entry_points.txt").write_text("\n".join(lines))
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
     monkeypatch.syspath_prepend(site)
     monkeypatch.setattr("psotrack.support.plugins._registered", {})
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    return two_flights(tmp_path_factory) / "flight"
-
-
-@pytest.fixture(scope="module")
-def recording(flight):
-    return pt.read_recording(flight)
+def recording(tmp_path_factory):
+    return pt.read_recording(two_flights(tmp_path_factory) / "flight")
 
 
 @pytest.fixture(scope="module")
@@ -263,41 +263,47 @@ def track(recording, tmp_path_factory):
 
 
 @pytest.fixture
-def run_track(flight, run_psotrack, tmp_path):
+def run_track(recording, run_psotrack, tmp_path):
     """Runs `psotrack track` with some options: the tracks and the record."""
 
     def run_track(*options):
         out = tmp_path / "tracks.csv"
-        words = ["track", flight, "--out", out, "--cache", tmp_path / "cache", "--jobs", 1, "--force"]
-        words += ["--init", "truth", "--drone-size", "0.3,0.3,0.15", "--particles", 16, *options]
-        ran = run_psotrack(*words)
+        words = ["track", recording.folder, "--out", out, "--cache", tmp_path / "cache", "--jobs", 1]
+        words += ["--init", "truth", "--drone-size", "0.3,0.3,0.15", "--particles", 16]
+        ran = run_psotrack(*words, *options)
         assert ran.code == 0, ran
-        return pt.read_trajectories(out, fps=25.0), json.loads(out.with_suffix(".json").read_text())
+        record = json.loads(out.with_suffix(".json").read_text())
+        return pt.read_trajectories(out, fps=25.0), record
 
     return run_track
 
 
-def mean_error_m(trajectories, recording):
-    return pt.evaluate(trajectories, recording.truth).mean_error_m
+def assert_hovering(tracks, record):
+    """The drones stay where they are at frame 0, which no method of the package says of flying drones."""
+    for position_m in tracks.position_m:
+        np.testing.assert_allclose(position_m, record["start"]["position_m"], atol=1e-4)
 
 
 def test_search_score_and_background_together_find_the_drones(track, recording):
     parts = {"search": RandomSearch(), "score": HighDice()}
     tracked = track(background=MedianBackground(), **parts)
-    assert tracked.trajectories.seen.all()
-    assert mean_error_m(tracked.trajectories, recording) < NEAR_M
-    names = {kind: part["class"].rpartition(".")[2] for kind, part in tracked.record["parts"].items()}
-    assert names == {"search": "RandomSearch", "score": "HighDice", "background": "MedianBackground"}
-    assert tracked.record["parts"]["background"]["key"] == {"threshold": 25, "reduction": 1}
+    trajectories = tracked.trajectories
+    assert trajectories.seen.all()
+    assert pt.evaluate(trajectories, recording.truth).mean_error_m < NEAR_M
+    recorded = tracked.record["parts"]
+    assert recorded["search"]["class"] == f"{__name__}.RandomSearch"
+    assert recorded["score"]["class"] == f"{__name__}.HighDice"
+    assert recorded["background"] == identify(MedianBackground())
     # The score decides the fitness, which is unknown where a drone coasts.
-    fitness = tracked.trajectories.fitness[tracked.trajectories.status == Status.TRACKED]
+    fitness = trajectories.fitness[trajectories.status == Status.TRACKED]
     assert len(fitness) > NUM_FRAMES
-    assert (fitness >= 0.9).all()
-    assert (fitness < 1.0).all()
+    assert fitness.min() >= 0.9
+    assert fitness.max() < 1.0
     # A model that sees no foreground loses the drones; its silhouettes are stored under another key.
     blind = track(background=MedianBackground(threshold=255), **parts)
     assert not (blind.trajectories.status == Status.TRACKED).any()
-    assert not {*tracked.record["input_keys"].values()} & {*blind.record["input_keys"].values()}
+    stored = set(tracked.record["input_keys"].values())
+    assert stored.isdisjoint(blind.record["input_keys"].values())
 
 
 def test_a_method_is_given_the_boxes_of_the_detector_and_its_tracks_are_the_result(track, recording):
@@ -310,9 +316,7 @@ def test_a_method_is_given_the_boxes_of_the_detector_and_its_tracks_are_the_resu
 
     first = tuple(next(read_frames(video)) for video in recording.videos.values())
     tracked = track(method=Reads(reads_detections=True), detector=EmptyHallDetector(first))
-    start_m = np.asarray(tracked.record["start"]["position_m"])
-    assert (tracked.trajectories.position_m == np.broadcast_to(start_m, (NUM_FRAMES, 2, 3))).all()
-    assert tracked.record["parts"]["method"]["class"].endswith("Reads")
+    assert_hovering(tracked.trajectories, tracked.record)
     # Frame 0 is the picture of the empty hall itself, so nothing differs.
     assert np.isnan(given[0].centre_px[0]).all()
     assert np.isfinite(given[0].centre_px[-1]).any()
@@ -320,41 +324,28 @@ def test_a_method_is_given_the_boxes_of_the_detector_and_its_tracks_are_the_resu
 
 def test_search_background_and_score_by_entry_points(run_track):
     tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard")
-    assert record["settings"]["swarm"]["search"] == "prediction"
     # Small images are not reduced.
-    key = {"threshold": 25, "reduction": 1}
-    assert record["parts"] == {"background": {"class": f"{__name__}.MedianBackground", "key": key}}
+    assert record["parts"] == {"background": identify(MedianBackground(reduction=1))}
     # The measured position is always the predicted one, so the drones fly on with the velocity of frame 0.
     steps_m = np.diff(tracks.position_m, axis=0)
     assert np.abs(steps_m).max() > 0.01
     np.testing.assert_allclose(steps_m, np.broadcast_to(steps_m[0], steps_m.shape), atol=1e-3)
-    tracks, record = run_track("--search", "prediction", "--score", "high-dice")
-    assert record["settings"]["score"]["kind"] == "high-dice"
+    tracks, _ = run_track("--score", "high-dice", "--force")
     # The fitness is that of HighDice, as in Python: 0.9, rounded to float32, or more.
     assert (tracks.fitness >= np.float32(0.9) - 1e-6).all()
     assert (tracks.fitness < 1.0).all()
 
 
-def test_a_method_and_a_detector_by_entry_points(run_track, recording):
-    """No method of the package writes such tracks of flying drones: they stay where they are at frame 0."""
-    tracks, record = run_track("--method", "hover")
-    assert record["settings"]["method"] == "hover"
-    start_m = np.asarray(record["start"]["position_m"])
-    np.testing.assert_allclose(tracks.position_m, np.broadcast_to(start_m, (NUM_FRAMES, 2, 3)), atol=1e-4)
-    tracks, record = run_track("--method", "projection-lines", "--detector", "empty-hall")
-    detector = record["parts"]["detector"]
-    assert detector["class"] == f"{__name__}.EmptyHallDetector"
+def test_a_method_and_a_detector_by_entry_points(run_track):
+    tracks, record = run_track("--method", "hover", "--detector", "empty-hall")
+    assert_hovering(tracks, record)
     # The threshold is made from the smallest confidence of the detector's settings, 0.25.
-    assert detector["key"]["threshold"] == 25
-    assert tracks.seen.all()
-    assert mean_error_m(tracks, recording) < NEAR_M
+    assert record["parts"]["detector"] == identify(EmptyHallDetector(EMPTY_HALL, threshold=25))
 
 
 def test_a_registered_plugin_is_made_from_its_part_of_the_settings_and_replaced():
     pt.register_plugin("search", "own", lambda swarm: RandomSearch(step_m=2 * swarm.spread_m))
-    pt.register_plugin("score", "own", lambda score: Dice(ring=2 * score.windows[-1]))
     assert find_search(pt.SwarmSettings(search="own")) == RandomSearch(step_m=0.1)
-    assert find_score(pt.ScoreSettings(kind="own")) == Dice(ring=2.0)
     pt.register_plugin("search", "own", lambda swarm: RandomSearch(shrink=0.5))
     assert find_search(pt.SwarmSettings(search="own")) == RandomSearch(shrink=0.5)
 
@@ -366,42 +357,42 @@ def test_what_silhouettes_are_made_of_is_the_class_too():
 
 #: What an object that is no part lacks.
 FACE = "expected an object with the attributes of psotrack."
-#: The call, with a function that tracks, and what the line says.
-BAD = [
-    (lambda track: track(search=1), f"search: {FACE}Search, found an object of int"),
-    (lambda track: track(score=print), f"score: {FACE}Score, found an object of builtin_function"),
-    (lambda track: track(method=print), f"method: {FACE}Method, found an object of builtin_function"),
-    (lambda track: track(background=print), f"background: {FACE}BackgroundModel, found an object of builtin"),
-    (lambda track: track(detector=print), f"detector: {FACE}Detector, found an object of builtin_function"),
-    (
-        lambda track: find_detector("broken", DetectorSettings()),
-        f"detector broken: {FACE}Detector, found an ",
-    ),
-    (
-        lambda track: track(background=CoarseBackground()),
-        "expected 14 masks of type uint8 and shape (240, 320)",
-    ),
-    (lambda track: track(detector=EmptyHallDetector(EMPTY_HALL)), "expected a method that reads detections"),
-    (
-        lambda track: pt.register_plugin("searches", "own", print),
-        "kind: expected one of search, score, method, background, detector, found 'searches'",
-    ),
-    (lambda track: pt.register_plugin("search", "own", 1), "make: expected a function, found 1"),
-    (
-        lambda track: find_search(pt.SwarmSettings(search="predict")),
-        "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
-    ),
-    (
-        lambda track: find_detector("yolo", DetectorSettings()),
-        "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo",
-    ),
-    (
-        lambda track: find_background("absent", ForegroundSettings()),
-        "background absent: expected test_bring_your_own:no_such_function to be importable, found module ",
-    ),
+#: Parts that do not fit, and what the line says.
+BAD_PARTS = [
+    ({"search": 1}, f"search: {FACE}Search, found an object of int"),
+    ({"background": CoarseBackground()}, "expected 14 masks of type uint8 and shape (240, 320)"),
+    ({"detector": EmptyHallDetector(EMPTY_HALL)}, "expected a method that reads detections"),
 ]
 
 
-@pytest.mark.parametrize(("call", "line"), BAD)
-def test_parts_that_do_not_fit_are_one_line(track, call, line, tmp_path):
-    assert_refused(partial(call, track), line, unchanged=tmp_path)
+@pytest.mark.parametrize(("parts", "line"), BAD_PARTS)
+def test_parts_that_do_not_fit_are_one_line(track, parts, line, tmp_path):
+    assert_refused(lambda: track(**parts), line, unchanged=tmp_path)
+
+
+#: Calls with names that lead to no plugin, and what the line says.
+BAD_NAMES = [
+    (
+        partial(find_search, pt.SwarmSettings(search="predict")),
+        "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
+    ),
+    (
+        partial(find_detector, "yolo", DetectorSettings()),
+        "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo",
+    ),
+    (partial(find_detector, "broken", DetectorSettings()), f"detector broken: {FACE}Detector, found an "),
+    (
+        partial(find_background, "absent", ForegroundSettings()),
+        "background absent: expected test_bring_your_own:no_such_function to be importable, found module ",
+    ),
+    (
+        partial(pt.register_plugin, "searches", "own", print),
+        "kind: expected one of search, score, method, background, detector, found 'searches'",
+    ),
+    (partial(pt.register_plugin, "search", "own", 1), "make: expected a function, found 1"),
+]
+
+
+@pytest.mark.parametrize(("call", "line"), BAD_NAMES)
+def test_a_name_without_a_plugin_is_one_line(call, line, tmp_path):
+    assert_refused(call, line, unchanged=tmp_path)
