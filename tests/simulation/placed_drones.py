@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import msgspec
 import numpy as np
+import pytest
 
 from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build, scenario
@@ -125,6 +126,19 @@ def around(pixel, reach):
     """The window of an image within `reach` pixels of a pixel, and the window's first (x, y)."""
     x, y = np.round(pixel).astype(int)
     return np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1], np.array([x - reach, y - reach])
+
+
+def assert_drawn_at(share, corners, *, atol_px, area_rel):
+    """Assert that the share of light that drones hide has the place and the area of the outline of corners, pixels.
+
+    Returns the window of the image around the outline.
+    """
+    expected, area = centre_and_area(corners)
+    window, first = around(expected, 24)
+    middle, _ = mean_and_variance(share[window])
+    np.testing.assert_allclose(middle + first, expected, atol=atol_px)
+    assert share[window].sum() == pytest.approx(area, rel=area_rel)
+    return window
 
 
 def number_image(renderer, frame=0):
