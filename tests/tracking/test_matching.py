@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from helpers import (
     LENSES,
-    draw_coverage,
     make_unnamed_rig,
     move_world,
     project_points,
     ring_rig,
-    silhouettes_in_memory,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +25,6 @@ from psotrack.tracking.matching import (
     UNEXPLAINED_COST,
     epipolar_distance,
     from_detections,
-    from_silhouettes,
     match,
 )
 
@@ -49,23 +46,29 @@ def observe(rig, drones, rng, *, noise_px, missed=0.0, false=0):
     """Simulate detections: per camera, their pixels in random order, and the number of each one's drone (-1: none)."""
     pixels = project_points(rig, drones)
     points, owners = [], []
-    for c in range(len(rig)):
+    for camera in range(len(rig)):
         seen = np.flatnonzero(rng.random(len(drones)) >= missed)
-        real = pixels[seen, c] + noise_px * rng.normal(size=(len(seen), 2))
-        ghosts = rng.uniform((0, 0), rig.cameras.image_size_wh[c], (false, 2))
+        real_px = pixels[seen, camera] + noise_px * rng.normal(size=(len(seen), 2))
+        false_px = rng.uniform((0, 0), rig.cameras.image_size_wh[camera], (false, 2))
         order = rng.permutation(len(seen) + false)
-        points.append(np.vstack([real, ghosts])[order])
-        owners.append(np.concatenate([seen, np.full(false, -1)])[order])
+        points.append(np.vstack([real_px, false_px])[order])
+        owner = np.concatenate([seen, np.full(false, -1)])
+        owners.append(owner[order])
     return points, owners
 
 
+def points_by_camera(rig, drones):
+    """The pixels of the drones, as a list over the cameras."""
+    return list(project_points(rig, drones).swapaxes(0, 1))
+
+
 def match_points(rig, points, noise_px, bounds_m=BOUNDS_M, **options):
-    """Match detections, per camera; all have the same noise, or there is one noise for each."""
-    counts = list(map(len, points))
-    there = np.arange(max(counts)) < np.array(counts)[:, None]
-    points_px, noise = np.full((*there.shape, 2), np.nan), np.full(there.shape, np.nan)
+    """Match detections, per camera; all have the same noise."""
+    counts = np.array([len(each) for each in points])
+    there = np.arange(counts.max()) < counts[:, None]
+    points_px = np.full((*there.shape, 2), np.nan)
     points_px[there] = np.concatenate(points)
-    noise[there] = noise_px if np.isscalar(noise_px) else np.concatenate(noise_px)
+    noise = np.where(there, noise_px, np.nan)
     return match(rig.cameras, points_px, noise, bounds_m=bounds_m, **options)
 
 
@@ -93,23 +96,21 @@ def test_a_sighting_is_at_the_middle_of_its_box_and_is_less_certain_at_the_image
     assert np.isnan(from_detections(given, rig, 1).centre_px).all()
 
 
-def test_blobs_of_silhouettes_are_sightings():
-    rig, reduction, position_m = ring_rig(4), 2, np.array([[0.2, -0.3, 1.2]])
-    image = draw_coverage(rig, position_m, [0.6, 0.6, 0.6], reduction)
-    silhouettes = silhouettes_in_memory(rig, np.repeat(image[None], 30, axis=0), reduction)
-    sightings = from_silhouettes(silhouettes)
-    assert sightings.centre_px.shape == (30, 4, 1, 2)
-    # The image of a sphere is not exactly centred on the image of its middle, and cells are 2 px wide.
-    np.testing.assert_allclose(sightings.centre_px[-1, :, 0], project(rig.cameras, position_m)[0], atol=1.5)
-
-
 # --- epipolar lines
 
 
 def distort_by_opencv(cam, straight):
     """Pixels after distortion by OpenCV, from pixels without distortion."""
     rays = np.column_stack([straight, np.ones(len(straight))]) @ np.linalg.inv(cam.K).T
-    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), cam.K, np.array(cam.dist))[0][:, 0]
+    still = np.zeros(3)
+    pixels, _ = cv2.projectPoints(rays, still, still, cam.K, np.array(cam.dist))
+    return pixels[:, 0]
+
+
+def opencv_distance(points, image, F, others):
+    """(points, others), distances of the others from the epipolar lines of points in the image of this number."""
+    lines = cv2.computeCorrespondEpilines(points[:, None], image, F)[:, 0]
+    return np.abs(lines[:, :2] @ others.T + lines[:, 2:])
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
@@ -117,18 +118,18 @@ def test_distances_from_epipolar_lines_equal_opencvs(coefficients):
     rig = ring_rig(5, coefficients=coefficients)
     rng = np.random.default_rng(0)
     a, b = rig.cameras[1], rig.cameras[3]
-    straight = [rng.uniform((60, 60), (260, 180), (count, 2)) for count in (7, 3)]
-    bent = [distort_by_opencv(cam, points) for cam, points in zip((a, b), straight, strict=True)]
+    straight_a = rng.uniform((60, 60), (260, 180), (7, 2))
+    straight_b = rng.uniform((60, 60), (260, 180), (3, 2))
     R = b.T_cam_world[:3, :3] @ a.T_cam_world[:3, :3].T
-    t = b.T_cam_world[:3, 3] - R @ a.T_cam_world[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    x, y, z = b.T_cam_world[:3, 3] - R @ a.T_cam_world[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     F = np.linalg.inv(b.K).T @ cross @ R @ np.linalg.inv(a.K)
-    found = epipolar_distance(a, b, *bent)
-    for side, (first, second) in enumerate(((0, 1), (1, 0))):
-        lines = cv2.computeCorrespondEpilines(straight[first][:, None], first + 1, F)[:, 0]
-        off = np.abs(lines[:, :2] @ straight[second].T + lines[:, 2:])
-        # Distortion is inverted to 1e-8 (see test_cameras), which is 3e-6 px.
-        np.testing.assert_allclose(found[..., side], off if side == 0 else off.T, atol=1e-5)
+    found = epipolar_distance(a, b, distort_by_opencv(a, straight_a), distort_by_opencv(b, straight_b))
+    # Distortion is inverted to 1e-8 (see test_cameras), which is 3e-6 px.
+    in_b = opencv_distance(straight_a, 1, F, straight_b)
+    np.testing.assert_allclose(found[..., 0], in_b, atol=1e-5)
+    in_a = opencv_distance(straight_b, 2, F, straight_a)
+    np.testing.assert_allclose(found[..., 1], in_a.T, atol=1e-5)
 
 
 # --- the least total cost
@@ -136,38 +137,40 @@ def test_distances_from_epipolar_lines_equal_opencvs(coefficients):
 
 def reprojection_cost(rig, points, group, noise_px):
     """Least sum of squared reprojection errors of a group, in standard deviations, by SciPy."""
-    seen = [c for c, index in enumerate(group) if index >= 0]
-    picked = np.array([points[c][group[c]] for c in seen])
+    seen = [camera for camera, index in enumerate(group) if index >= 0]
+    picked_px = np.array([points[camera][group[camera]] for camera in seen])
+    cameras = rig.cameras[np.array(seen)]
 
     def residual(point):
-        return ((project(rig.cameras[np.array(seen)], point)[0] - picked) / noise_px).ravel()
+        pixels, _ = project(cameras, point)
+        return ((pixels - picked_px) / noise_px).ravel()
 
     return 2 * least_squares(residual, np.array([0.0, 0.0, 1.3]), method="lm").cost
 
 
 def least_total(rig, points, noise_px):
-    """Groups with the least total cost for three cameras, and this cost, by a search of all assignments."""
-    triples = [
-        (triple, cost)
-        for triple in product(*(range(len(detections)) for detections in points))
-        if (cost := reprojection_cost(rig, points, triple, noise_px)) < 3 * UNEXPLAINED_COST
-    ]
-    best, chosen = UNEXPLAINED_COST * sum(map(len, points)), frozenset()
+    """Groups with the least total cost for three cameras, by a search of all assignments."""
+    triples = {}
+    for triple in product(*(range(len(each)) for each in points)):
+        cost = reprojection_cost(rig, points, triple, noise_px)
+        if cost < 3 * UNEXPLAINED_COST:
+            triples[triple] = cost
+    best = {}
 
-    def search(start, used, groups, total):
-        nonlocal best, chosen
-        if total < best:
-            best, chosen = total, frozenset(groups)
-        for number in range(start, len(triples)):
-            triple, cost = triples[number]
+    def search(number, groups, total):
+        best[frozenset(groups)] = total
+        used = set().union(*map(set, map(enumerate, groups)))
+        for next_number in range(number, len(triples)):
+            triple = list(triples)[next_number]
             shared = len(used & set(enumerate(triple)))
             # A group may share at most one of its three detections.
             if shared < 2:
-                change = NEW_GROUP_COST + cost + SHARED_COST * shared - UNEXPLAINED_COST * (3 - shared)
-                search(number + 1, used | set(enumerate(triple)), [*groups, triple], total + change)
+                explained = UNEXPLAINED_COST * (3 - shared)
+                cost = NEW_GROUP_COST + triples[triple] + SHARED_COST * shared - explained
+                search(next_number + 1, [*groups, triple], total + cost)
 
-    search(0, frozenset(), [], best)
-    return set(chosen), best
+    search(0, [], 0.0)
+    return set(min(best, key=best.get))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -177,8 +180,7 @@ def test_groups_have_the_least_total_cost_of_all_assignments(seed):
     rig = ring_rig(3, image_size_wh=LARGE_WH, coefficients=(0, 5)[seed % 2])
     drones = separate_points(2 + seed % 2, rng)
     points, _ = observe(rig, drones, rng, noise_px=3.0, missed=0.1, false=seed // 2 % 2)
-    expected, _ = least_total(rig, points, 3.0)
-    assert groups_of(match_points(rig, points, 3.0)) == expected
+    assert groups_of(match_points(rig, points, 3.0)) == least_total(rig, points, 3.0)
 
 
 # --- groups with two views
@@ -187,11 +189,12 @@ def test_groups_have_the_least_total_cost_of_all_assignments(seed):
 def test_two_views_are_no_group_without_a_prediction():
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = separate_points(2, np.random.default_rng(0))
-    points = list(project_points(rig, drones).swapaxes(0, 1))
+    points = points_by_camera(rig, drones)
     points[1] = points[3] = points[4] = np.empty((0, 2))
     assert not len(match_points(rig, points, 1.0).position_m)
     # A prediction of one drone permits a group for that drone only.
-    with_prediction = match_points(rig, points, 1.0, expected=(drones[1:], 0.01 * np.eye(3)[None]))
+    prediction = drones[1:], 0.01 * np.eye(3)[None]
+    with_prediction = match_points(rig, points, 1.0, expected=prediction)
     assert with_prediction.detection.tolist() == [[1, -1, 1, -1, -1]]
     assert with_prediction.expected.tolist() == [0]
     np.testing.assert_allclose(with_prediction.position_m, drones[1:], atol=1e-6)
@@ -205,7 +208,7 @@ def test_detections_that_are_not_finite_and_drones_out_of_bounds_are_ignored():
     """The first drone is near the middle of all images, where NaN could be mistaken for a valid detection."""
     rig = ring_rig(4, image_size_wh=LARGE_WH, coefficients=4)
     drones = np.array([[0.1, -0.1, 1.2], [1.0, 0.5, 2.0]])
-    points = list(project_points(rig, drones).swapaxes(0, 1))
+    points = points_by_camera(rig, drones)
     points[1][0], points[2][1, 0] = np.nan, np.inf
     assert groups_of(match_points(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
     upper = np.array([[-4.0, -4.0, 1.5], [4.0, 4.0, 4.0]])
@@ -216,10 +219,13 @@ def test_detections_that_are_not_finite_and_drones_out_of_bounds_are_ignored():
 def test_cameras_at_one_place_count_as_one_view(least):
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = separate_points(2, np.random.default_rng(1))
-    for places, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
-        placed = make_unnamed_rig(*(rig.cameras[i] for i in places))
-        points = list(project_points(placed, drones).swapaxes(0, 1))
-        assert len(match_points(placed, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
+
+    def num_groups(places):
+        placed = make_unnamed_rig(*(rig.cameras[place] for place in places))
+        return len(match_points(placed, points_by_camera(placed, drones), 1.0, min_views=least).position_m)
+
+    assert num_groups(range(least)) == 2
+    assert num_groups([0, 0, *range(least - 1)]) == 0
 
 
 def test_groups_have_the_number_of_their_prediction():
@@ -233,13 +239,14 @@ def test_groups_have_the_number_of_their_prediction():
     expected_m[2] += (0.0, 0.0, 1.5)
     spread = np.broadcast_to(0.05**2 * np.eye(3), (3, 3, 3))
     matches = match_points(rig, points, 1.0, expected=(expected_m, spread))
-    named = dict(zip(matches.expected.tolist(), matches.position_m, strict=False))
-    assert sorted(matches.expected.tolist()) == [-1, -1, 0, 1]
+    numbers = matches.expected.tolist()
+    assert sorted(numbers) == [-1, -1, 0, 1]
     for number in (0, 1):
+        group = numbers.index(number)
         # A pixel is 4 mm, and a group has five views.
-        assert np.linalg.norm(named[number] - drones[order[number]]) < 0.02
-        row = matches.detection[matches.expected == number][0]
-        assert all(owners[c][i] == order[number] for c, i in enumerate(row) if i >= 0)
+        assert np.linalg.norm(matches.position_m[group] - drones[order[number]]) < 0.02
+        for camera, index in enumerate(matches.detection[group]):
+            assert index < 0 or owners[camera][index] == order[number]
 
 
 # --- merged, false and ambiguous detections
@@ -247,10 +254,11 @@ def test_groups_have_the_number_of_their_prediction():
 
 def test_a_merged_detection_is_shared():
     """Two drones in line with the second of three cameras, which has one detection between them."""
-    rig = make_unnamed_rig(*(ring_rig(5, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3)))
-    centre, near = rig.cameras.centre_world[1], np.array([0.1, 0.3, 1.2])
-    far = near + 0.8 * (near - centre) / np.linalg.norm(near - centre) + np.array([0.0, 0.0, 0.01])
-    points = list(project_points(rig, np.stack([near, far])).swapaxes(0, 1))
+    rig = ring_rig(5, image_size_wh=LARGE_WH).select(["c0", "c1", "c3"])
+    near = np.array([0.1, 0.3, 1.2])
+    ray = near - rig.cameras.centre_world[1]
+    far = near + 0.8 * ray / np.linalg.norm(ray) + np.array([0.0, 0.0, 0.01])
+    points = points_by_camera(rig, np.stack([near, far]))
     width_px = np.linalg.norm(points[1][0] - points[1][1])
     points[1] = points[1].mean(axis=0)[None]
     assert groups_of(match_points(rig, points, width_px / 3.0)) == {(0, 0, 0), (1, 0, 1)}
@@ -260,15 +268,12 @@ def test_a_merged_detection_is_shared():
 
 def test_random_detections_or_none_give_no_groups():
     rig = ring_rig(6, image_size_wh=LARGE_WH)
-    rng = np.random.default_rng(0)
-    points = [rng.uniform((0, 0), LARGE_WH, (2, 2)) for _ in range(6)]
+    points = np.random.default_rng(0).uniform((0, 0), LARGE_WH, (6, 2, 2))
     assert not len(match_points(rig, points, 1.0).position_m)
-    assert not len(match_points(rig, [np.empty((0, 2))] * 6, 1.0).position_m)
-    one_camera = [points[0], *[np.empty((0, 2))] * 5]
-    assert match_points(rig, one_camera, 1.0).detection.shape == (0, 6)
+    none = np.empty((6, 0, 2))
+    assert not len(match_points(rig, none, 1.0).position_m)
     prediction = np.zeros((2, 3)), np.broadcast_to(np.eye(3), (2, 3, 3))
-    predicted_only = match_points(rig, [np.empty((0, 2))] * 6, 1.0, expected=prediction)
-    assert predicted_only.expected.shape == (0,)
+    assert not len(match_points(rig, none, 1.0, expected=prediction).position_m)
 
 
 @pytest.mark.parametrize("off_px", [1.0, 2.0, 4.0])
@@ -277,31 +282,19 @@ def test_ambiguity_is_a_likelihood_ratio(off_px):
 
     Both drones would keep three views, so only this cost decides between the two assignments.
     """
-    rig = make_unnamed_rig(*(ring_rig(7, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3, 5)))
+    rig = ring_rig(7, image_size_wh=LARGE_WH).select(["c0", "c1", "c3", "c5"])
     crossing = np.array([0.3, -0.2, 1.1])
-    drones = np.stack([0.8 * crossing + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
-    points = list(project_points(rig, drones).swapaxes(0, 1))
+    drones = 0.8 * crossing + 0.2 * rig.cameras.centre_world[:2]
+    points = points_by_camera(rig, drones)
     alone = match_points(rig, points, 1.0)
     assert alone.ambiguity.tolist() == [0.0, 0.0]
-    points[2] = np.vstack([points[2], project_points(rig, crossing)[2] + (0.0, off_px)])
+    beside_px = project_points(rig, crossing)[2] + (0.0, off_px)
+    points[2] = np.vstack([points[2], beside_px])
     matches = match_points(rig, points, 1.0)
-    assert groups_of(matches) == groups_of(alone) == {(0, 0, 0, 0), (1, 1, 1, 1)}
+    assert groups_of(matches) == groups_of(alone)
     expected = np.exp(-reprojection_cost(rig, points, (0, 1, 2, -1), 1.0) / 2)
     # `match` computes points from weighted linear equations, not from the least reprojection error: limit 5 %.
     np.testing.assert_allclose(matches.ambiguity, expected, rtol=0.05)
-
-
-def test_two_boxes_of_one_drone_are_not_ambiguous():
-    """Three of five cameras have a second box 1 cm higher; whichever box is in the group, the drone is the same."""
-    rig = ring_rig(5, image_size_wh=LARGE_WH)
-    drones = separate_points(2, np.random.default_rng(0))
-    points = list(project_points(rig, drones).swapaxes(0, 1))
-    higher = project_points(rig, drones[0] + np.array([0.0, 0.0, 0.01]))
-    for c in range(3):
-        points[c] = np.vstack([points[c], higher[c]])
-    matches = match_points(rig, points, 2.0)
-    assert groups_of(matches) >= {(0,) * 5, (1,) * 5}
-    assert not matches.ambiguity.any()
 
 
 # --- properties
@@ -310,20 +303,16 @@ def test_two_boxes_of_one_drone_are_not_ambiguous():
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_order_and_world_frame_do_not_matter(seed):
-    """Groups are the same with cameras and detections in another order, and in a turned and shifted world."""
+    """Groups are the same with cameras in another order, and in a turned and shifted world."""
     rng = np.random.default_rng(seed)
     rig = ring_rig(6, image_size_wh=LARGE_WH)
     drones = separate_points(int(rng.integers(1, 6)), rng)
     points, _ = observe(rig, drones, rng, noise_px=2.0, missed=0.1, false=1)
     matches = match_points(rig, points, 2.0)
     order = rng.permutation(6)
-    within = [rng.permutation(len(detections)) for detections in points]
-    mixed_rig = rig.select([rig.names[c] for c in order])
-    mixed = match_points(mixed_rig, [points[c][within[c]] for c in order], 2.0)
-    back = np.full_like(mixed.detection, -1)
-    for place, c in enumerate(order):
-        seen = mixed.detection[:, place] >= 0
-        back[seen, c] = within[c][mixed.detection[seen, place]]
+    mixed = match_points(rig.select([rig.names[c] for c in order]), [points[c] for c in order], 2.0)
+    back = np.empty_like(mixed.detection)
+    back[:, order] = mixed.detection
     assert {tuple(row) for row in back.tolist()} == groups_of(matches)
 
     R = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()

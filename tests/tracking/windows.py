@@ -1,6 +1,7 @@
 """Functions that cut, unpack and score windows of the silhouettes, and search them for the best position of a drone."""
 
 from functools import partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 from helpers import far_camera, float32, make_unnamed_rig
 
 from psotrack.foreground.silhouettes import LOW_BITS, summed_area_table
-from psotrack.geometry import make_extents
+from psotrack.geometry import look_at, make_camera, make_extents
 from psotrack.tracking.swarm import SoftIoU
 from psotrack.tracking.swarm.fitness import ScoreInputs, drone_fitness, score_inputs
 from psotrack.tracking.swarm.patches import SIDE, ExpectedDrones, cut, make_pyramid
@@ -29,6 +30,14 @@ def far_rig(reduction):
     return make_unnamed_rig(
         *(far_camera(image_size_wh=sides, pixels_per_m=reduction * ppm) for ppm in PIXELS_PER_M)
     )
+
+
+def camera_at(place_m, target_m, *, focal_px, image_size_wh, up=(0.0, 0.0, 1.0)):
+    """A camera without distortion that looks at a place."""
+    R, t_m = look_at(place_m, target_m, up=up)
+    width, height = image_size_wh
+    K = np.array([[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]])
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
 
 
 def middle_px(position_m, pixels_per_m):
@@ -77,7 +86,8 @@ def _words(patches):
 
 def enumerate_windows(windows):
     """Iterate over ((drone, camera), window)."""
-    return (((d, c), windows[d, c]) for d in range(windows.shape[0]) for c in range(windows.shape[1]))
+    for index in np.ndindex(windows.shape[:2]):
+        yield index, windows[index]
 
 
 def evaluate(function, rig, patches, position_m, size_m):
@@ -105,11 +115,13 @@ def best_place(rig, patches, about_m, size_m):
 @partial(jax.jit, static_argnums=0)
 def _best_place(settings, patches, cameras, best_m, size_m):
     view = ScoreInputs(make_extents(cameras, size_m), patches, settings)
-    unit = np.stack(np.meshgrid(*[np.arange(-4, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    unit = np.array(list(product(range(-4, 5), repeat=3)))[:, None]
 
     def closer(best_m, step_m):
         places = best_m + step_m * jnp.asarray(unit, jnp.float32)
         best = jnp.nan_to_num(drone_fitness(view, places)).argmax(axis=0)
         return places[best, jnp.arange(len(best))], None
 
-    return jax.lax.scan(closer, best_m, jnp.asarray([0.02, 0.006, 0.002, 0.0006], jnp.float32))[0]
+    steps_m = jnp.asarray([0.02, 0.006, 0.002, 0.0006], jnp.float32)
+    best_m, _ = jax.lax.scan(closer, best_m, steps_m)
+    return best_m
