@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from board_rigs import HELD, HELD_K, draw_board, draw_sheet, film_board, random_poses
 from real_data import published
-from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import (
     Board,
@@ -58,8 +57,10 @@ def draw_grid(board, T):
 
 def draw_chess(T):
     """Grey image of the chessboard, with a white border."""
-    sheet = np.kron(np.add.outer(np.arange(5), np.arange(6)) % 2, np.ones((75, 75))) * 255
-    return draw_sheet(np.pad(sheet.astype(np.uint8), 60, constant_values=255), 60, 2500.0, HELD_K, T, SIZE_WH)
+    squares = np.add.outer(np.arange(5), np.arange(6)) % 2
+    sheet = np.kron(255 * squares, np.ones((75, 75))).astype(np.uint8)
+    sheet = np.pad(sheet, 60, constant_values=255)
+    return draw_sheet(sheet, 60, 2500.0, HELD_K, T, SIZE_WH)
 
 
 def drawn(count, board=HELD):
@@ -108,21 +109,17 @@ def test_a_board_is_drawn_in_its_true_size(tmp_path):
 # What a board is, by images.
 
 
-#: Name of the case -> the printed board, and its images.
-PRINTED = {
-    "white on black": (HELD, [255 - image for image in drawn(3)]),
-    "chessboard": (CHESS, [draw_chess(pose) for pose in POSES[:3]]),
-}
+def test_a_charuco_board_follows_from_images_and_the_side_of_a_square():
+    white_on_black = [255 - image for image in drawn(3)]
+    found = detect_board(0.04, white_on_black)
+    assert found.squares_wh == HELD.squares_wh
+    assert found.marker_m == pytest.approx(HELD.marker_m, rel=0.04)
+    assert found.dictionary == "4x4_50"
 
 
-@pytest.mark.parametrize(("printed", "images"), PRINTED.values(), ids=PRINTED)
-def test_what_a_board_is_follows_from_images_and_the_side_of_a_square(printed, images):
-    found = detect_board(printed.square_m, images)
-    assert found.squares_wh == printed.squares_wh
-    assert found.kind == printed.kind
-    if printed.marker_m is not None:
-        assert found.marker_m == pytest.approx(printed.marker_m, rel=0.04)
-        assert found.dictionary == "4x4_50"
+def test_a_chessboard_follows_from_images_and_the_side_of_a_square():
+    found = detect_board(0.03, [draw_chess(pose) for pose in POSES[:3]])
+    assert found == CHESS
 
 
 @pytest.mark.parametrize("inverted", [False, True])
@@ -209,17 +206,6 @@ def test_four_webcams():
     assert np.nanmedian(calibrated.residual_px) < 0.6
 
 
-@pytest.mark.slow
-@pytest.mark.real
-def test_a_stereo_pair_and_a_chessboard():
-    """OpenCV's sample reports 0.22 px."""
-    folder = published("kyamagu/mexopencv") / "test"
-    cameras = open_images([folder / f"{side}??.jpg" for side in ("left", "right")])
-    found = find_views(Board((10, 7), 0.025, kind="chessboard"), cameras, instants_of_numbers(cameras))
-    calibrated = calibrate_rig(found.board, found.views)
-    assert np.sqrt(np.mean(calibrated.residual_px[calibrated.used] ** 2)) < 0.24
-
-
 # The lens of a camera.
 
 
@@ -251,36 +237,18 @@ STRONG_LENSES = {
 }
 
 
-def random_view(board, model, focal_px, dist, rng):
-    """(corners, 2), pixels of a board that faces the camera, more or less, in any direction that the image shows."""
-    K = np.array([[focal_px, 0, 645], [0, 1.002 * focal_px, 352], [0, 0, 1]])
-    across, down = rng.uniform((-1.1, -0.62), (1.1, 0.62))
-    aim = np.array([across * 600 / focal_px, down * 600 / focal_px, 1.0])
-    R, _ = Rotation.align_vectors([aim], [[0.0, 0.0, 1.0]])
-    tilt = Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True)
-    distance_m = 0.4 * focal_px / rng.uniform(300, 560)
-    middle_m = distance_m * aim / np.linalg.norm(aim)
-    places_m = (R * tilt).apply(board.corners_m - board.corners_m.mean(axis=0)) + middle_m
-    show = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
-    pixels, _ = show(places_m[:, None], np.zeros(3), np.zeros(3), K, np.array(dist))
-    pixels = pixels.reshape(-1, 2)
-    outside = (pixels < 0) | (pixels > (1279, 719))
-    hidden = outside.any(axis=1) | (places_m[:, 2] < 0.05)
-    pixels[hidden] = np.nan
-    return pixels + rng.normal(0, 0.1, pixels.shape)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STRONG_LENSES)
 def test_the_model_of_a_lens_is_found(name):
-    """Boards through OpenCV's own formulas, with errors of 0.1 px."""
+    """A board 6 to 35 cm away, up to 65 degrees off the axis, by OpenCV's own formulas; errors of 0.1 px."""
     focal_px, dist = STRONG_LENSES[name]
-    board = Board((8, 6), 0.05, 0.0375)
+    K = np.array([[focal_px, 0, 645], [0, 1.002 * focal_px, 352], [0, 0, 1]])
+    show = cv2.fisheye.projectPoints if name == "fisheye" else cv2.projectPoints
     rng = np.random.default_rng(3)
     views = []
-    while len(views) < 20:
-        view = random_view(board, name, focal_px, dist, rng)
-        if np.isfinite(view[:, 0]).sum() >= 12:
-            views.append(view)
-    chosen = choose_lens_model(board, np.array(views), (1280, 720))
+    for T in random_poses(20):
+        places_m = HELD.corners_m @ T[:3, :3].T + T[:3, 3] - np.array([0.0, 0.0, 0.2])
+        pixels, _ = show(places_m[:, None], np.zeros(3), np.zeros(3), K, np.array(dist))
+        views.append(pixels[:, 0] + rng.normal(0, 0.1, (len(pixels), 2)))
+    chosen = choose_lens_model(HELD, np.array(views), (1280, 720))
     assert str(chosen) == name

@@ -12,7 +12,6 @@ from board_rigs import (
     BOARD,
     HELD,
     HELD_K,
-    WORLD_M,
     Scene,
     draw_board,
     film_board,
@@ -42,13 +41,11 @@ from psotrack.calibration import (
     find_views,
     fit_world,
     instants_of_numbers,
-    lens_of_view,
     locate_camera,
     open_images,
     read_point_views,
     read_world,
 )
-from psotrack.calibration.clocks import camera_offsets
 from psotrack.calibration.rig.moving_point import adjust
 from psotrack.evaluation import find_offset
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
@@ -89,19 +86,23 @@ def write_lines(path, lines):
 def test_a_rig_from_marks(calibrate, tmp_path):
     rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
     write_rig(tmp_path / "lenses.yml", rig)
-    pairs, out = write_pairs(tmp_path / "pairs.csv", rig, wrong=("c1", 4)), tmp_path / "rig.toml"
+    pairs = write_pairs(tmp_path / "pairs.csv", rig, wrong=("c1", 4))
+    out = tmp_path / "rig.toml"
     words = ("rig", "--pairs", pairs, "--lenses", tmp_path / "lenses.yml", "--out", out)
     said = calibrate(*words, "--json", tmp_path / "report.json")
     assert "p4" in said
     assert "left out" in said
-    found, rows = read_rig(out), json.loads((tmp_path / "report.json").read_text())["cameras"]
+    found = read_rig(out)
     assert found.names == rig.names
+    rows = json.loads((tmp_path / "report.json").read_text())["cameras"]
     for index, name in enumerate(rig.names):
-        row, centre_m = rows[name], found.cameras.centre_world[index]
+        row = rows[name]
+        centre_m = found.cameras.centre_world[index]
+        off_m = np.abs(centre_m - rig.cameras.centre_world[index])
         assert row["points"] - row["used"] == (name == "c1")
         np.testing.assert_allclose(row["centre_m"], centre_m, atol=1e-12)
         # Five standard deviations: one in a million.
-        assert (np.abs(centre_m - rig.cameras.centre_world[index]) < 5 * np.array(row["centre_std_m"])).all()
+        assert (off_m < 5 * np.array(row["centre_std_m"])).all()
         assert max(row["centre_std_m"]) < 0.01
         assert 0.3 < row["rms_px"] < 1.2
     worst = rows["c1"]["worst"][0]
@@ -109,52 +110,47 @@ def test_a_rig_from_marks(calibrate, tmp_path):
 
 
 def test_positions_in_a_separate_file_and_a_lens_from_a_data_sheet(calibrate, tmp_path):
-    K = np.array([[800.0, 0, 639.5], [0, 800.0, 359.5], [0, 0, 1]])
-    R, t_m = look_at((4.0, 0.5, 2.0), (0.0, 0.0, 1.2))
-    rig = make_rig({"60881257": make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))})
-    pixels = project(rig.cameras[0], WORLD_M)[0].tolist()
-    pairs = [f"60881257,p{i},{x},{y}" for i, (x, y) in enumerate(pixels)]
+    pairs = [f"60881257,p{i},{x},{y}" for i, (x, y) in enumerate(PIXELS.tolist())]
     write_lines(tmp_path / "pairs.csv", ["camera,point,x_px,y_px", *pairs])
-    places = [f"p{i},{x},{y},{z}" for i, (x, y, z) in enumerate(WORLD_M.tolist())]
-    write_lines(tmp_path / "points.csv", ["point,x_m,y_m,z_m", *places])
-    view_deg = [2 * np.rad2deg(np.arctan(side / 2 / 800)) for side in (1280, 720)]
-    lens = ("--fov", f"{view_deg[0]},{view_deg[1]}", "--size", "1280,720")
+    world(tmp_path / "points.csv", {f"p{i}": place for i, place in enumerate(POINTS_M.tolist())})
+    # The angles of the whole image, half a pixel beyond the first and the last pixels' centres.
+    width_deg, height_deg = np.degrees(2 * np.arctan([960 / 1157, 540 / 1157]))
+    lens = ("--fov", f"{width_deg},{height_deg}", "--size", "1920,1080")
     files = ("--pairs", tmp_path / "pairs.csv", "--places", tmp_path / "points.csv")
     calibrate("rig", *files, *lens, "--out", tmp_path / "a.toml", "-q")
-    centre_m = read_rig(tmp_path / "a.toml").cameras.centre_world
-    np.testing.assert_allclose(centre_m, rig.cameras.centre_world, atol=1e-6)
+    found = read_rig(tmp_path / "a.toml")
+    np.testing.assert_allclose(found.cameras.centre_world, [CAMERA.centre_world], atol=1e-6)
 
 
 def test_a_rig_from_markers_on_the_walls(calibrate, tmp_path):
     """A sequence with a camera that sees markers on two walls; and the same by a video for each camera."""
-    K = np.array([[1150.0, 0, 639.5], [0, 1150.0, 359.5], [0, 0, 1]])
-    R, t_m = look_at((4.0, -2.5, 2.2), (-0.6, 0.8, 1.2))
-    rig = make_rig({"cam1i": make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1280, 720))})
     corners = {}
-    for number, (y, z) in enumerate([(0.25, 1.65), (1.15, 0.35), (1.15, 1.65), (0.35, 0.35)]):
+    for number, (y, z) in enumerate([(-0.25, 1.65), (-1.15, 0.35), (-1.15, 1.65), (-0.35, 0.35)]):
         corners[number + 3] = marker_at((-1.5, y, z), (1, 0, 0), side_m=0.5)
     for number, (x, z) in enumerate([(-1.05, 1.65), (-0.15, 0.85), (0.75, 1.65)]):
-        corners[number + 20] = marker_at((x, 1.5, z), (0, -1, 0), side_m=0.5)
+        corners[number + 20] = marker_at((x, -1.5, z), (0, 1, 0), side_m=0.5)
     folder = tmp_path / "ROOM"
     folder.mkdir()
-    with VideoWriter(folder / "cam1i_s.avi", 25.0, (1280, 720)) as writer:
+    with VideoWriter(folder / "cam1i_s.avi", 25.0, (1920, 1080)) as writer:
         for _ in range(3):
-            writer.write(draw_markers(corners, rig.cameras[0]))
-    write_calibration(folder / "cameras_calibration.csv", rig)
+            writer.write(draw_markers(corners, CAMERA))
+    write_calibration(folder / "cameras_calibration.csv", make_rig({"cam1i": CAMERA}))
     write_marker_corners(folder / "aruco_corners.csv", corners)
     known = ("--markers", folder / "aruco_corners.csv", "--noise", "0.3")
-    lens = ("--lenses", folder / "cameras_calibration.csv", "--size", "1280,720")
-    row = calibrate("rig", folder, *known, *lens, "--out", tmp_path / "rig.toml", "--json", "-")
-    row = row["cameras"]["cam1i"]
+    lens = ("--lenses", folder / "cameras_calibration.csv", "--size", "1920,1080")
+    content = calibrate("rig", folder, *known, *lens, "--out", tmp_path / "rig.toml", "--json", "-")
+    row = content["cameras"]["cam1i"]
     assert row["points"] == 7 * 4
-    assert int(row["worst"][0]["point"].partition(".")[0]) in corners
+    number, _, _ = row["worst"][0]["point"].partition(".")
+    assert int(number) in corners
     lens = ("--lenses", tmp_path / "rig.toml")
     calibrate("rig", folder / "cam1i_s.avi", *known, *lens, "--out", tmp_path / "again.toml")
     for name, file in (("cam1i", "rig.toml"), ("cam1i_s", "again.toml")):
         found = read_rig(tmp_path / file)
         assert found.names == (name,)
+        off_m = found.cameras.centre_world[0] - CAMERA.centre_world
         # A tenth of a pixel at 5 m is 0.5 mm, but corners in compressed video have larger errors.
-        assert np.linalg.norm(found.cameras.centre_world - rig.cameras.centre_world) < 0.01
+        assert np.linalg.norm(off_m) < 0.01
 
 
 # Boards.
@@ -163,42 +159,44 @@ STATED = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03", "--diction
 
 
 def poses_by_two_cameras(count=8):
-    """Pairs of poses of the board in the hand, before a left camera and one that is 0.1 m to its right."""
-    for T in random_poses(count):
-        right = T.copy()
-        right[0, 3] -= 0.1
-        yield T, right
+    """Poses of the board in the hand before a left camera, and before one that is 0.1 m to its right."""
+    left = np.array(list(random_poses(count)))
+    right = left.copy()
+    right[:, 0, 3] -= 0.1
+    return {"left": left, "right": right}
 
 
 @pytest.mark.slow
 def test_any_frame_of_a_long_video_may_be_the_floor(calibrate, tmp_path):
     """More than 300 frames are not all searched, which a line says; the frame of --floor always is."""
-    pairs, out = list(poses_by_two_cameras(18)), tmp_path / "rig.toml"
-    videos = [film_board(tmp_path / f"{i}.avi", (pair[i] for pair in pairs), 17) for i in range(2)]
+    poses = poses_by_two_cameras(18)
+    videos = [film_board(tmp_path / f"{name}.avi", poses[name], 17) for name in poses]
+    out = tmp_path / "rig.toml"
     said = calibrate("rig", *videos, *STATED, "--lens", "0", "--floor", "45", "--out", out)
     # Every second frame, and that of the floor.
-    assert "0 154 of 306, 1 154 of 306" in said
-    np.testing.assert_allclose(read_rig(out).cameras.T_cam_world[0, :3, 3], pairs[2][0][:3, 3], atol=0.01)
+    assert "left 154 of 306, right 154 of 306" in said
+    found = read_rig(out).cameras.T_cam_world[0]
+    np.testing.assert_allclose(found[:3, 3], poses["left"][2, :3, 3], atol=0.01)
 
 
 @pytest.mark.slow
 def test_a_rig_from_folders_of_images_of_a_board(calibrate, tmp_path, caplog):
     """Printed white on black; the function of the package gives the same."""
-    names = ("left", "right")
-    for number, pair in enumerate(poses_by_two_cameras()):
-        for name, T in zip(names, pair, strict=True):
-            (tmp_path / name).mkdir(exist_ok=True)
+    paths = []
+    for name, poses in poses_by_two_cameras().items():
+        (tmp_path / name).mkdir()
+        paths.append(str(tmp_path / name))
+        for number, T in enumerate(poses):
             image = 255 - draw_board(HELD, HELD_K, T, (640, 480))
-            cv2.imwrite(str(tmp_path / name / f"{number}.png"), image)
-    paths, out = [str(tmp_path / name) for name in names], tmp_path / "rig.toml"
+            cv2.imwrite(f"{paths[-1]}/{number}.png", image)
+    out = tmp_path / "rig.toml"
     content = calibrate("rig", *paths, *STATED, "--lens", "0", "--out", out, "--json", "-")
-    assert content["print"] == []
     known = {"squares": (7, 5), "square_m": 0.04, "marker_m": 0.03, "dictionary": "4x4_50", "lens": "0"}
     found = pt.calibrate_rig(paths, **known, out=out, force=True)
     assert json.loads(json.dumps(found.to_dict())) == content
     assert "the world is camera left" in str(found)
     rig = read_rig(out)
-    assert rig.names == names
+    assert rig.names == ("left", "right")
     np.testing.assert_allclose(rig.cameras.centre_world, [[0, 0, 0], [0.1, 0, 0]], atol=0.005)
     # Of one camera only the lens is found; test_boards has the exact bounds.
     one = ("rig", paths[0], *STATED, "--names", "60881257", "--out", tmp_path / "lens.toml")
@@ -207,23 +205,24 @@ def test_a_rig_from_folders_of_images_of_a_board(calibrate, tmp_path, caplog):
     assert words in caplog.text
     lens = read_lenses(tmp_path / "lens.toml")
     assert lens.names == ("60881257",)
-    assert content["focal_px"] == np.diag(lens.cameras.K[0])[:2].tolist()
-    assert abs(lens.cameras.K[0, 0, 0] - 620) < 12
+    f_x, f_y, _ = np.diag(lens.cameras.K[0])
+    assert content["focal_px"] == [f_x, f_y]
+    assert abs(f_x - 620) < 12
 
 
 # A moving point.
 
 
-def sightings(path, ends_m, noise_px=0.3, names=RIG.names):
-    """Table of the pixels of points, (ends, frames, 3); `point` only for two ends."""
-    rng, several = np.random.default_rng(0), len(ends_m) > 1
-    lines = ["camera,frame,x_px,y_px" + several * ",point"]
+def sightings(path, *ends_m, noise_px=0.3, names=RIG.names):
+    """Table of the pixels of points, (frames, 3) each, in the cameras of these names."""
+    rng = np.random.default_rng(0)
+    lines = ["camera,frame,x_px,y_px,point"]
     for end, points_m in enumerate(ends_m):
-        pixels = project(RIG.cameras, points_m[:, None])[0] + rng.normal(0, noise_px, (len(points_m), 3, 2))
-        for frame, of_frame in enumerate(pixels):
-            for name, (x, y) in zip(RIG.names, of_frame, strict=True):
-                if name in names:
-                    lines.append(f"{name},{frame},{x},{y}" + several * f",{end}")
+        pixels, _ = project(RIG.cameras, points_m[:, None])
+        pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+        for name in names:
+            of_camera = pixels[:, RIG.names.index(name)]
+            lines += [f"{name},{frame},{x},{y},{end}" for frame, (x, y) in enumerate(of_camera)]
     return write_lines(path, lines)
 
 
@@ -233,8 +232,9 @@ def world(path, places):
 
 
 def test_a_moving_point_with_one_length_or_a_world_and_a_stick(calibrate, tmp_path, lenses):
-    flown_m, out = fly_point(), tmp_path / "rig.toml"
-    light = sightings(tmp_path / "light.csv", flown_m[None])
+    flown_m = fly_point()
+    out = tmp_path / "rig.toml"
+    light = sightings(tmp_path / "light.csv", flown_m)
     start = ("--points", "--lenses", lenses, "--force", "--out", out)
     said = calibrate("rig", light, *start, "--distance", f"c0,c2={gaps_of(RIG)[0, 2]}")
     assert "the world is camera c0" in said
@@ -245,8 +245,8 @@ def test_a_moving_point_with_one_length_or_a_world_and_a_stick(calibrate, tmp_pa
     assert "10 points are met to" in said
     np.testing.assert_allclose(read_rig(out).cameras.centre_world, CENTRES_M, atol=0.03)
     turn = np.linspace(0, 12, 60)
-    along_m = 0.25 * np.stack([np.cos(turn), np.sin(turn), np.zeros(60)], axis=-1)
-    stick = sightings(tmp_path / "stick.csv", np.stack([flown_m - along_m, flown_m + along_m]))
+    along_m = 0.25 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
+    stick = sightings(tmp_path / "stick.csv", flown_m - along_m, flown_m + along_m)
     calibrate("rig", stick, *start, "--stick", "0.5")
     np.testing.assert_allclose(gaps_of(read_rig(out)), gaps_of(RIG), atol=0.03)
 
@@ -257,39 +257,44 @@ def test_a_moving_point_before_cameras_with_clocks_of_their_own(calibrate, tmp_p
     def at(t):
         return np.stack([0.8 * np.sin(t), 0.8 * np.cos(0.7 * t), 1.1 + 0.5 * np.sin(1.31 * t)], axis=-1)
 
-    lines, clocks = ["version = 1"], [(25.0, 0.0, 0.0), (30.0, -0.4, 0.0), (50.0, 0.013, 2e-5)]
+    lines = ["version = 1"]
+    clocks = [(25.0, 0.0, 0.0), (30.0, -0.4, 0.0), (50.0, 0.013, 2e-5)]
     for index, (fps, start_s, line_s) in enumerate(clocks):
-        name, time_s = RIG.names[index], start_s + np.arange(round(20 * fps)) / fps
+        frame = np.arange(round(20 * fps))
+        start_of_frame_s = start_s + frame / fps
+        time_s = start_of_frame_s
         for _ in range(3):
             # The row in which the point is seen says when the row was exposed.
-            pixels = project(RIG.cameras[index], at(time_s))[0]
-            time_s = start_s + np.arange(len(time_s)) / fps + line_s * pixels[:, 1]
-        boxes = np.concatenate([pixels - 4, pixels + 4], axis=1) + 0.5
-        write_detections(
-            tmp_path / f"{name}.csv", Detections(np.arange(len(boxes)), boxes, np.ones(len(boxes)))
-        )
+            pixels, _ = project(RIG.cameras[index], at(time_s))
+            time_s = start_of_frame_s + line_s * pixels[:, 1]
+        boxes = np.concatenate([pixels - 3.5, pixels + 4.5], axis=1)
+        name = RIG.names[index]
+        write_detections(tmp_path / f"{name}.csv", Detections(frame, boxes, np.ones(len(frame))))
         lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', "size = [1280, 720]", f"fps = {fps}"]
         lines += [f"time_offset_s = {start_s}", f"line_time_s = {line_s}"]
     recording = write_lines(tmp_path / "recording.toml", lines)
+    out = tmp_path / "rig.toml"
     apart = ("--distance", f"c0,c2={gaps_of(RIG)[0, 2]}")
-    calibrate("rig", recording, "--points", "--lenses", lenses, *apart, "--out", tmp_path / "rig.toml")
+    calibrate("rig", recording, "--points", "--lenses", lenses, *apart, "--out", out)
     # Half an interval of 20 ms at 1 m/s is 10 mm, and moves the cameras by more than that; boxes are whole pixels.
-    np.testing.assert_allclose(gaps_of(read_rig(tmp_path / "rig.toml")), gaps_of(RIG), atol=0.005)
+    np.testing.assert_allclose(gaps_of(read_rig(out)), gaps_of(RIG), atol=0.005)
 
 
 @pytest.mark.slow
 def test_sightings_that_hardly_determine_the_rig_are_named(calibrate, tmp_path, lenses):
     """A point far away before two cameras, 0.4 m apart, whose stated deviations contain the error."""
-    far_m, out = fly_point() * (0.5, 1, 1) + (0, 8, 0), tmp_path / "rig.toml"
-    light = sightings(tmp_path / "light.csv", far_m[None], noise_px=1.0, names=("c0", "c1"))
+    far_m = fly_point() * (0.5, 1, 1) + np.array([0.0, 8.0, 0.0])
+    out = tmp_path / "rig.toml"
+    light = sightings(tmp_path / "light.csv", far_m, noise_px=1.0, names=("c0", "c1"))
     known = world(tmp_path / "world.csv", dict(enumerate(far_m)))
     words = ("rig", light, "--points", "--lenses", lenses, "--out", out, "--world", known)
     content = calibrate(*words, "--json", "-")
     assert any("hardly determine the places of c0 (±" in note for note in content["notes"])
+    off_m = read_rig(out).cameras.centre_world - CENTRES_M[:2]
     for index, name in enumerate(("c0", "c1")):
         std_m = np.linalg.norm(content["cameras"][name]["centre_std_m"])
         assert std_m > 0.1 * gaps_of(RIG)[0, 1]
-        assert np.linalg.norm(read_rig(out).cameras.centre_world[index] - CENTRES_M[index]) < 4 * std_m
+        assert np.linalg.norm(off_m[index]) < 4 * std_m
 
 
 # Conversions.
@@ -300,21 +305,22 @@ def test_files_are_converted(calibrate, tmp_path):
     K = rig.cameras.K.copy()
     K[:, 1, 1] = K[:, 0, 0]
     rig = Rig(rig.names, replace(rig.cameras, K=K))
-    files = {name: tmp_path / name for name in ("a.toml", "b.yml", "c.csv", "d.toml", "mm.toml", "lens.toml")}
-    a, b, c, d, mm, lens = files.values()
+    a, b, c, d = tmp_path / "a.toml", tmp_path / "b.yml", tmp_path / "c.csv", tmp_path / "d.toml"
     write_rig(a, rig)
     assert "c2" in calibrate("convert", a, b)
     calibrate("convert", b, c, "-q")
-    assert calibrate("convert", c, d, "--size", "320,240", "--json", "-")["rig"] == str(d)
+    content = calibrate("convert", c, d, "--size", "320,240", "--json", "-")
+    assert content["rig"] == str(d)
     # Two files have Rodrigues vectors, whose conversion rounds.
     np.testing.assert_allclose(read_rig(d).cameras.T_cam_world, rig.cameras.T_cam_world, atol=1e-14)
-    calibrate("convert", a, mm, "--units", "mm", "-q")
-    in_mm = read_rig(mm).cameras.centre_world
+    out = tmp_path / "out.toml"
+    calibrate("convert", a, out, "--units", "mm", "-q")
+    in_mm = read_rig(out).cameras.centre_world
     np.testing.assert_allclose(in_mm, 1e-3 * rig.cameras.centre_world, atol=1e-15)
-    calibrate("convert", a, lens, "--lenses", "--undistorted", "-q")
-    assert read_lenses(lens).cameras.dist.size == 0
-    calibrate("convert", a, tmp_path / "other.toml", "--to", "anipose", "-q")
-    assert "[metadata]" in (tmp_path / "other.toml").read_text()
+    calibrate("convert", a, out, "--lenses", "--undistorted", "-q", "--force")
+    assert read_lenses(out).cameras.dist.size == 0
+    calibrate("convert", a, out, "--to", "anipose", "-q", "--force")
+    assert "[metadata]" in out.read_text()
 
 
 # What is refused.
@@ -366,23 +372,13 @@ def marks(*rows, header="camera,point,x_px,y_px,x_m,y_m,z_m"):
 def flat_views(folder, run):
     """A board that is turned and moved in the plane of the image alone is filmed."""
     poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("z", 3 * np.arange(10)[:, None], degrees=True).as_matrix()
-    poses[:, 0, 3], poses[:, 2, 3] = 0.005 * np.arange(10), 0.45
-    poses[:, :3, 3] -= poses[:, :3, :3] @ [0.14, 0.1, 0]
+    degrees = 3 * np.arange(10)[:, None]
+    poses[:, :3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    poses[:, :3, 3] = (0, 0, 0.45) - poses[:, :3, :3] @ [0.14, 0.1, 0]
+    poses[:, 0, 3] += 0.005 * np.arange(10)
     cameras = open_images([film_board(folder / "board.avi", poses)])
     found = find_views(HELD, cameras, instants_of_numbers(cameras))
     return partial(calibrate_rig, found.board, found.views, LensChoice(LensModel(4)))
-
-
-def blind_camera(folder, run):
-    """One of two cameras never sees the board."""
-    shown = draw_board(HELD, HELD_K, next(random_poses()), (640, 480))
-    for name, image in (("a", shown), ("b", np.zeros((480, 640), np.uint8))):
-        (folder / name).mkdir()
-        for number in range(2):
-            cv2.imwrite(str(folder / name / f"{number}.png"), image)
-    cameras = open_images([folder / "a", folder / "b"])
-    return lambda: find_views(HELD, cameras, instants_of_numbers(cameras))
 
 
 def board_views(change):
@@ -398,17 +394,17 @@ def few_views(pixels):
 
 
 def apart(pixels):
-    pixels[2, ::2], pixels[:2, 1::2] = np.nan, np.nan
+    pixels[2, ::2] = np.nan
+    pixels[:2, 1::2] = np.nan
 
 
-def offsets(path, *, max_offset_s=1.0, offset_s=0.2, **others):
+def offsets(path, *, max_offset_s=1.0, offset_s=0.2, backwards=False, **others):
     """The clock of a reference with this path is sought by noisy tracks."""
     estimate = simulate_estimate(path, offset_s=offset_s, noise_m=0.02, **others)
-    return calls(find_offset, estimate, *simulate_reference(path), max_offset_s=max_offset_s)
-
-
-def finds(estimate, time_s, max_offset_s=1.0):
-    return calls(find_offset, estimate, time_s, TRUTH_M, max_offset_s=max_offset_s)
+    time_s, position_m = simulate_reference(path)
+    if backwards:
+        time_s = time_s[::-1]
+    return calls(find_offset, estimate, time_s, position_m, max_offset_s=max_offset_s)
 
 
 def calibrates_point(pixels):
@@ -434,13 +430,14 @@ K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
 R, T_M = look_at((4.0, 3.0, 2.0), (0.0, 0.0, 1.0))
 CAMERA = make_camera(R=R, t_m=T_M, K=K, image_size_wh=(1920, 1080))
 POINTS_M = RNG.uniform((-1, -1, 0), (1, 1, 2), (12, 3))
-PIXELS = project(CAMERA, POINTS_M)[0]
-LINE_M = np.array([0, 0, 1.0]) + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
-BROKEN_M = np.where(np.arange(36).reshape(12, 3) == 7, np.nan, POINTS_M)
+PIXELS, _ = project(CAMERA, POINTS_M)
+#: Points on a line.
+LINE_M = POINTS_M[0] + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
+LINE_PX, _ = project(CAMERA, LINE_M)
 #: A sheet of 20 cm at a distance of 8 m, tilted a little, looks the same if it is tilted to the other side.
 SHEET_M = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
-SHEET_POSE = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-SHEET_CAMERA = make_camera(R=SHEET_POSE[0], t_m=SHEET_POSE[1], K=K, image_size_wh=(1920, 1080))
+SHEET_R, SHEET_T_M = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+SHEET_CAMERA = make_camera(R=SHEET_R, t_m=SHEET_T_M, K=K, image_size_wh=(1920, 1080))
 SHEET_PX = project(SHEET_CAMERA, SHEET_M)[0] + np.random.default_rng(0).normal(0, 0.5, (6, 2))
 located = partial(calls, locate_camera, name="camera c7")
 
@@ -450,16 +447,14 @@ def point_views(pixels):
     return PointViews(FOUR.names, np.zeros_like(count), count, pixels)
 
 
-FLOWN_PX = project(FOUR.cameras, fly_point()[:, None])[0]
-WITHOUT_C2 = np.where(np.arange(4)[:, None] == 2, np.nan, FLOWN_PX)
+FLOWN_PX, _ = project(FOUR.cameras, fly_point()[:, None])
 #: Two cameras see one half of the points, and the two others the rest.
-HALVES_PX = np.where((np.arange(4) < 2)[:, None] == (np.arange(60) < 30)[:, None, None], np.nan, FLOWN_PX)
-FEW_OF_C1 = np.where((np.arange(4)[:, None] == 1) & (np.arange(60)[:, None, None] > 4), np.nan, FLOWN_PX)
-LINE, SPREAD = np.arange(4.0)[:, None] * [1.0, 2.0, 0.5], np.eye(4, 3)
-TWO_ENDS = "camera,frame,point,x_px,y_px\n" + "c0,0,tip,1,1\n" * 2
+HALVES_PX = FLOWN_PX.copy()
+HALVES_PX[:30, :2] = np.nan
+HALVES_PX[30:, 2:] = np.nan
+LINE = np.arange(4.0)[:, None] * [1.0, 2.0, 0.5]
+END_TWICE = "camera,frame,point,x_px,y_px\nc0,0,tip,1,1\nc0,0,tip,1,1\n"
 SUN = "point,x_m,y_m,z_m\nc0,0,0,0\nc1,1,0,0\nsun,1,1,1\n"
-ESTIMATE, (TIME_S, TRUTH_M) = simulate_estimate(random_motion(0)), simulate_reference(random_motion(0))
-UNSEEN = replace(ESTIMATE, position_m=np.full_like(ESTIMATE.position_m, np.nan))
 GREY = [np.full((240, 320), 128, np.uint8)] * 3
 
 #: Name of the case -> how the bad input is made, and words of the line.
@@ -469,41 +464,30 @@ BAD = {
     "unknown point": (pairs("c1,p3,", "c1,p99,"), "line 19, column point: expected x_m, y_m, z_m in one of"),
     "no lens of it": (pairs("c1,p3,", "c9,p3,"), "lenses.toml: expected the lens of c9, found only c0, c1"),
     "two places": (marks("c0,p,1,2,0,0,1", "c1,p,3,4,0,0,2"), "line 3", "p at [0.0, 0.0, 1.0], as before"),
-    "one point": (marks("c0,p,1,2,0,0,1"), "4 points of known position, found 1"),
     "no places": (marks("c0,p,1,2", header="camera,point,x_px,y_px"), "line 2", "or in a file of places"),
     "three points": (located(POINTS_M[:3], PIXELS[:3], CAMERA), "camera c7", "known position, found 3"),
-    "a line": (located(LINE_M, project(CAMERA, LINE_M)[0], CAMERA), "camera c7", "not all on one line"),
-    "not finite": (located(BROKEN_M, PIXELS, CAMERA), "camera c7", "NaN"),
+    "a line": (located(LINE_M, LINE_PX, CAMERA), "camera c7", "not all on one line"),
     "mirrored": (located(POINTS_M * [1, -1, 1], PIXELS, CAMERA), "right-handed axes", "mirrored"),
     "mixed up": (located(POINTS_M, PIXELS[RNG.permutation(12)], CAMERA), "camera c7", "mixed up"),
     "small plane": (located(SHEET_M, SHEET_PX, SHEET_CAMERA), "camera c7", "two poses"),
-    "no noise": (located(POINTS_M, PIXELS, CAMERA, 0.0), "noise_px"),
     # Boards and their views.
     "no board": (calls(detect_board, 0.04, GREY), "or a chessboard, found neither in 3 images"),
     "large marker": (calls(Board, (7, 5), 0.04, 0.05), "board.marker_m"),
-    "two rows": (calls(Board, (7, 2), 0.04, 0.03), "at least 3 x 3 squares"),
     "dictionary": (calls(Board((7, 5), 0.04, 0.03, "9x9").opencv), "dictionary", "4x4_50", "found 9x9"),
     "coefficients": (calls(LensModel, 6), "coefficients, found 6"),
-    "field of view": (calls(lens_of_view, 180.0, 60.0, (640, 480)), "between 0 and 180"),
     # The fit ended at a focal length of 320 000 px, with which the boards seem tilted, and that lens was accepted.
     "flat, far": (flat_views, "views that determine the focal length"),
     "few views": (board_views(few_views), "camera c1: expected at least 5 views of 6 corners"),
     "apart": (board_views(apart), "no instant at which one of c0, c1 and one of c2 see the board together"),
-    "blind camera": (blind_camera, "camera b: expected views of the board", "found none in 2 frames"),
-    "no floor": (calls(calibrate_rig, BOARD, Scene(RIG).views(RNG), floor=70), "floor: ", "found frame 70"),
-    "camera twice": (calls(open_images, ["a/board", "a/board"]), "each camera once, found board again"),
     "no images": (calls(open_images, ["top*.png"]), "images of this pattern, found none"),
     "one name": (calls(open_images, ["a/board", "b/board"], ["a"]), "2 names, found 1"),
     # A moving point, and the world.
     "few instants": (calibrates_point(FLOWN_PX[:8]), "points: expected at least 12 instants"),
-    "unseen by one": (calibrates_point(WITHOUT_C2), "camera c2: expected at least 12 instants"),
-    "few of one": (calls(adjust, FOUR, point_views(FEW_OF_C1)), "c1: expected at least 6 points", "found 5"),
     "two halves": (calls(adjust, FOUR, point_views(HALVES_PX)), "cameras: expected points that connect all"),
     "no camera top": (calls(distance_between, FOUR, "c0", "top"), "two of c0, c1, c2, c3, found c0,top"),
-    "end twice": (reads(TWO_ENDS, read_point_views), "each point once per camera and frame, found 0 of c0"),
+    "end twice": (reads(END_TWICE, read_point_views), "each point once per camera and frame, found 0 of c0"),
     "two of three": (reads(SUN, fit_read_world), "found 2 of 3"),
-    "a line given": (calls(align, SPREAD, LINE, with_scale=True), "not on one line, found 4 on a line"),
-    "a line seen": (calls(align, LINE, SPREAD, with_scale=True), "as the rig knows them; check the lenses"),
+    "a line given": (calls(align, np.eye(4, 3), LINE, with_scale=True), "not on one line, found 4 on a line"),
     # Clocks.
     "hardly moves": (offsets(random_motion(0, 0.01)), "the offset to a frame, 0.04 s, found a"),
     "hovers": (offsets(straight(0.0)), "if the drones hover"),
@@ -511,30 +495,18 @@ BAD = {
     "circles": (offsets(circle, max_offset_s=1.2), "one offset that fits best", "narrow the range"),
     "out of range": (offsets(random_motion(0), max_offset_s=0.3, offset_s=0.9), "end of the range, +0.3 s"),
     "no common time": (offsets(random_motion(0), start_s=60.0), "of both at offsets within 1 s, found none"),
-    "small range": (finds(ESTIMATE, TIME_S, 0.001), "expected a step of the reference, 0.01 s"),
-    "back in time": (finds(ESTIMATE, TIME_S[::-1]), "reference at two increasing times"),
-    "one frame": (
-        finds(ESTIMATE.at_frames(np.array([5])), TIME_S),
-        "estimate of two frames or more, found 1",
-    ),
-    "never seen": (finds(UNSEEN, TIME_S), "found none"),
-    "five of four": (calls(camera_offsets, FOUR, np.zeros((9, 1, 5, 2)), 25.0), "4 cameras, found 5"),
-    "no offsets": (calls(camera_offsets, FOUR, np.zeros((9, 1, 4, 2)), 0.0), "fps"),
+    "back in time": (offsets(random_motion(0), backwards=True), "reference at two increasing times"),
     # The commands.
     "two ways": (calibrates("--pairs a --markers b"), "found --pairs and --markers"),
     "no way": (calibrates("a b"), "expected one of --square, --squares, --points, --pairs, --markers"),
     "lens of a board": (calibrates("a.mp4 --square 0.04 --fov 60,40"), "--fov: expected points or markers"),
     "no lens": (calibrates("--pairs {pairs}"), "--lenses: expected a calibration with the lens of"),
-    "two lenses": (calibrates("--pairs {pairs} --fov 60,40 --lenses {lenses}"), "found both"),
     "no size": (calibrates("--pairs {pairs} --fov 60,40"), "--size: expected width and height"),
-    "a video": (calibrates("a.mp4 --pairs {pairs} --lenses {lenses}"), "--pairs: expected no video"),
     "a world": (calibrates("--pairs {pairs} --world {pairs} --lenses {lenses}"), "--world: expected none"),
     "no scale": (calibrates("{light} --points --lenses {lenses}"), "and --world FILE, found none"),
     "two scales": (calibrates("{light} --points --lenses {lenses} --distance c0,c2=1 --stick 1"), "found 2"),
     "one end": (calibrates("{light} --points --lenses {lenses} --stick 1"), "two ends of a stick"),
     "far floor": (calibrates("{board} --squares 7x5 --square 0.04 --marker 0.03 --floor 99"), "one is 13"),
-    "inches": (runs("calibrate convert {lenses} {new} --units inch"), "one of m, cm, mm, found inch"),
-    "one side": (runs("calibrate convert c.csv {new} --size 320"), "expected two whole numbers above 0"),
     "fx, fy": (runs("calibrate convert {lenses} {tmp}/a.csv"), "expected one focal length, found fx"),
     "without places": (runs("doctor {unplaced}"), "lens and place are known, found none for left, right"),
 }
@@ -553,12 +525,11 @@ def make_files(folder):
 @pytest.mark.parametrize(("prepare", "words"), [(one, words) for one, *words in BAD.values()], ids=BAD)
 def test_bad_input_is_refused_in_one_line(prepare, words, tmp_path_factory, run_psotrack, tmp_path):
     files = make_once(tmp_path_factory, "calibration_files", make_files)
+    paths = {path.stem: path for path in files.iterdir()}
+    paths["tmp"] = tmp_path
+    paths["new"] = tmp_path / "new.toml"
 
     def run(line):
-        paths = {path.stem: path for path in files.iterdir()} | {
-            "tmp": tmp_path,
-            "new": tmp_path / "new.toml",
-        }
         return run_psotrack(*(word.format(**paths) for word in line.split()))
 
     assert_refused(prepare(tmp_path, run), *words, unchanged=tmp_path)

@@ -10,22 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from board_rigs import record_detections
-from helpers import ring_rig
+from helpers import project_points, ring_rig
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import psotrack as pt
-from psotrack.calibration.doctor import evidence, examine, sampled_frames
+from psotrack.calibration.doctor import evidence, examine
 from psotrack.calibration.doctor.common_points import CommonPoints
 from psotrack.calibration.doctor.corrections import PER_CAMERA, Corrected, WeightedPoints, linearise, weigh
-from psotrack.geometry import Rig, project
+from psotrack.geometry import Rig
 from psotrack.tracking.matching import from_detections
 from psotrack.trajectories import Trajectories
 
 #: The rigs, bodies and detectors of the study, and whether a finding names what was planted.
 JUDGE = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "calibration" / "doctor.py"))
 make_case, judge, boxes, FPS = JUDGE["make_case"], JUDGE["judge"], JUDGE["_boxes"], JUDGE["FPS"]
-SLOW = pytest.mark.slow
 
 
 #: Small white errors of the boxes.
@@ -38,49 +37,56 @@ class World:
     def __init__(self, seed=0, lags=None, *, far=1.0, **scene):
         rng = np.random.default_rng(seed)
         self.scene = boxes.Scene(**(WHITE | scene))
-        rig, flight = boxes.make_true_rig(self.scene, rng), boxes.make_flight(self.scene, rng)
+        rig = boxes.make_true_rig(self.scene, rng)
+        flight = boxes.make_flight(self.scene, rng)
         self.rig = with_poses(rig, t_m=far * rig.cameras.T_cam_world[:, :3, 3])
         self.flight = replace(flight, middle_m=far * flight.middle_m, reach_m=far * flight.reach_m)
         self.seen = boxes.record(self.rig, self.flight, self.scene, rng, lags)
-        self.truth_m = self.flight.at(np.arange(self.scene.frames) / FPS)[0]
+        self.truth_m, *_ = self.flight.at(np.arange(self.scene.frames) / FPS)
 
     def examined(self, rig=None, reference_m=None, seen=None):
-        rig, reference = self.rig if rig is None else rig, None
-        sightings = from_detections(self.seen if seen is None else seen, rig, self.scene.frames)
+        """The diagnosis of a rig, its own by default, with a reference of these positions, or none."""
+        rig = rig or self.rig
+        if seen is None:
+            seen = self.seen
+        reference = None
         if reference_m is not None:
-            frame, names = np.arange(len(reference_m)), tuple(f"dron{i}" for i in range(reference_m.shape[1]))
+            frame = np.arange(len(reference_m))
+            names = tuple(f"dron{i}" for i in range(reference_m.shape[1]))
             reference = Trajectories(frame, frame / FPS, names, reference_m)
+        sightings = from_detections(seen, rig, self.scene.frames)
         return examine(rig, sightings, fps=FPS, reference=reference)
 
 
 def with_poses(rig, R=None, t_m=None):
+    """The rig with other rotations or translations, or both."""
     T = rig.cameras.T_cam_world.copy()
-    T[:, :3, :3] = T[:, :3, :3] if R is None else R
-    T[:, :3, 3] = T[:, :3, 3] if t_m is None else t_m
+    if R is not None:
+        T[:, :3, :3] = R
+    if t_m is not None:
+        T[:, :3, 3] = t_m
     return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
 def turned(rig, index, turn_deg):
     """The rig with one camera that is turned about its own axes."""
-    R = rig.cameras.T_cam_world[:, :3, :3].copy()
     turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
-    R[index], t_m = turn @ R[index], rig.cameras.T_cam_world[:, :3, 3].copy()
-    t_m[index] = turn @ t_m[index]
-    return with_poses(rig, R, t_m)
+    T = rig.cameras.T_cam_world.copy()
+    T[index, :3] = turn @ T[index, :3]
+    return with_poses(rig, T[:, :3, :3], T[:, :3, 3])
 
 
 def moved(rig, index, shift_m):
-    T = rig.cameras.T_cam_world
-    return with_poses(rig, t_m=T[:, :3, 3] + np.outer(np.arange(len(rig)) == index, shift_m))
+    t_m = rig.cameras.T_cam_world[:, :3, 3].copy()
+    t_m[index] += shift_m
+    return with_poses(rig, t_m=t_m)
 
 
 INDOORS, FEW = World(), World(frames=40)
 RIG = INDOORS.rig
-R, T_M, CENTRES_M = (
-    RIG.cameras.T_cam_world[:, :3, :3],
-    RIG.cameras.T_cam_world[:, :3, 3],
-    RIG.cameras.centre_world,
-)
+R = RIG.cameras.T_cam_world[:, :3, :3]
+T_M = RIG.cameras.T_cam_world[:, :3, 3]
+CENTRES_M = RIG.cameras.centre_world
 OPENGL, LEFT = np.array([1.0, -1.0, -1.0]), np.array([1.0, 1.0, -1.0])
 #: The third axis of the world and of the cameras is mirrored, so rotations remain rotations.
 LEFT_HANDED = with_poses(RIG, LEFT[:, None] * R * LEFT, LEFT * T_M)
@@ -90,11 +96,9 @@ FAULTS = {
     "turned": (turned(RIG, 2, (0, 1, 0)), "turned", ("cam3",), r"turned by (0\.[89]\d*|1\.[01]\d*) degrees"),
     "moved": (moved(RIG, 4, (0.1, 0, 0)), "moved", ("cam5",), r"moved by ([89]|1[012]) cm"),
     "turned far": (turned(RIG, 2, (0, 12, 0)), "disagrees", ("cam3",), "it was turned or moved far"),
-    "moved far": (moved(RIG, 1, (1.5, 0, 0.5)), "disagrees", ("cam2",), "it was turned or moved far"),
     "centres": (with_poses(RIG, R, CENTRES_M), "translation or centre", (), "^(?!.*rotation)"),
     "to the world": (with_poses(RIG, R.mT, CENTRES_M), "translation or centre", (), "from camera to world"),
     "millimetres": (with_poses(RIG, R, 1e3 * T_M), "unit", (), "millimetres were read as metres"),
-    "metres": (with_poses(RIG, R, 1e-3 * T_M), "unit", (), "metres were read as millimetres"),
     "axes of OpenGL": (IN_OPENGL, "mirrored axes", (), "y, z are mirrored as in OpenGL"),
     "a left-handed world": (LEFT_HANDED, "mirrored axes", (), "left-handed"),
     "a lens": (boxes.refocused(RIG, 3, 1.06), "focal length", ("cam4",), r"(5\.[5-9]|6\.[0-3]) % too long"),
@@ -102,16 +106,12 @@ FAULTS = {
 }
 
 
-SECOND_OF_ITS_KIND = ("moved far", "to the world", "metres")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=SLOW if name in SECOND_OF_ITS_KIND else ()) for name in FAULTS]
-)
+@pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_of_the_rig_is_named(name):
     rig, kind, cameras, message = FAULTS[name]
     (finding,) = FEW.examined(rig, FEW.truth_m).findings
-    assert (finding.kind, finding.cameras) == (kind, cameras), finding
+    assert finding.kind == kind, finding
+    assert finding.cameras == cameras, finding
     assert re.search(message, finding.message), finding.message
 
 
@@ -163,24 +163,25 @@ def test_a_sound_rig_agrees_with_its_reference_and_its_clocks():
     assert np.nanmax(np.abs(diagnosis.late_frames)) < 0.25
 
 
-def test_too_few_detections_and_detections_of_different_flights_accuse_no_camera():
-    first = {
-        name: replace(found, frame=found.frame[:1], xyxy=found.xyxy[:1], confidence=found.confidence[:1])
-        for name, found in INDOORS.seen.items()
-    }
-    for seen in (first, {}):
-        assert [one.kind for one in INDOORS.examined(seen=seen).findings] == ["too little seen"]
+def only_finding(diagnosis):
+    (finding,) = diagnosis.findings
+    return finding.kind
+
+
+def test_too_few_detections_accuse_no_camera():
+    assert only_finding(INDOORS.examined(seen={})) == "too little seen"
     # Ten frames of one drone agree with the rig, but are too few to judge it.
     (finding,) = World(drones=1, frames=10).examined().findings
     assert finding.kind == "too little seen"
     assert "the rig" not in finding.message
-    # Each camera sees another flight.
-    others = [World(40 + index).flight for index in range(5)]
-    seen = {
-        name: boxes.record(RIG, flight, INDOORS.scene, np.random.default_rng(0))[name]
-        for name, flight in zip(RIG.names, others, strict=True)
-    }
-    assert [one.kind for one in INDOORS.examined(seen=seen).findings] == ["no agreement"]
+
+
+def test_detections_of_different_flights_accuse_no_camera():
+    seen = {}
+    for index, name in enumerate(RIG.names):
+        flight = World(40 + index).flight
+        seen[name] = boxes.record(RIG, flight, INDOORS.scene, np.random.default_rng(0))[name]
+    assert only_finding(INDOORS.examined(seen=seen)) == "no agreement"
 
 
 def test_two_cameras_are_checked():
@@ -189,16 +190,9 @@ def test_two_cameras_are_checked():
     diagnosis = two.examined(reference_m=two.truth_m)
     assert diagnosis.findings == ()
     assert diagnosis.to_dict()["explained"] > 0.85
-    diagnosis = two.examined(turned(two.rig, 1, (1, 0, 0)))
-    assert [(one.kind, one.cameras) for one in diagnosis.findings] == [("unclear", two.rig.names)]
-    assert diagnosis.residual_px.min() > 10
-
-
-def test_sampled_frames_are_in_the_video():
-    for num_frames in (0, 1, 10, 15, 40, 5000):
-        frames = sampled_frames(num_frames)
-        assert len(frames) == min(num_frames, 168) or 12 <= len(frames) <= 168
-        assert ((frames >= 0) & (frames < num_frames)).all()
+    (finding,) = two.examined(turned(two.rig, 1, (1, 0, 0))).findings
+    assert finding.kind == "unclear"
+    assert finding.cameras == two.rig.names
 
 
 OUTDOORS = {
@@ -211,38 +205,27 @@ OUTDOORS = {
 }
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_rig_that_explains_nothing_is_not_sound(seed):
+def test_a_rig_that_explains_nothing_is_not_sound():
     """Every camera is turned by about a degree, tens of pixels: no three agree, and no single fault explains it."""
-    world = World(seed, **OUTDOORS)
-    rig = world.rig
-    for index in range(3):
-        rig = turned(rig, index, np.roll((0.4, 0.9, 0.2), index))
+    world = World(**OUTDOORS)
+    rig = turned(world.rig, 0, (0.4, 0.9, 0.2))
+    rig = turned(rig, 1, (0.2, 0.4, 0.9))
+    rig = turned(rig, 2, (0.9, 0.2, 0.4))
     diagnosis = world.examined(rig)
     assert diagnosis.to_dict()["explained"] < 0.05
     assert diagnosis.findings
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(7, marks=SLOW)])
-def test_errors_that_last_look_like_no_turn(seed):
+def test_errors_that_last_look_like_no_turn():
     """Sound rigs of three cameras and one body, whose errors of several pixels last for about a second."""
-    assert World(seed, noise_px=2.5, lasting=0.98, **OUTDOORS).examined().findings == ()
+    world = World(4, noise_px=2.5, lasting=0.98, **OUTDOORS)
+    assert world.examined().findings == ()
 
 
 def test_far_cameras_that_see_bodies_of_plausible_size_are_no_wrong_unit():
     """Cameras hundreds of metres apart that see a drone: metres, not millimetres."""
-    assert World(far=60.0, drones=1, frames=40, noise_px=0.3, size=4.0).examined().findings == ()
-
-
-@pytest.mark.slow
-def test_a_small_lag_does_not_hide_a_turned_camera():
-    """One video lags by a small part of a frame, which many frames show for certain; another camera is turned."""
-    exact = {"noise_px": 0.2, "noise_share": 0.0, "lasting": 0.0, "missed": 0.0, "false_alarms": 0.0}
-    world = World(lags={"cam2": 0.06}, drones=1, frames=300, **exact)
+    world = World(far=60.0, drones=1, frames=40, size=4.0)
     assert world.examined().findings == ()
-    (finding,) = world.examined(turned(world.rig, 3, (0, 0.6, 0))).findings
-    assert (finding.kind, finding.cameras) == ("turned", ("cam4",))
-    assert "place it anew with `psotrack calibrate rig --pairs`" in finding.remedy
 
 
 # The cases of the study.
@@ -250,23 +233,21 @@ def test_a_small_lag_does_not_hide_a_turned_camera():
 
 def diagnosed(number, fault="", cameras=None):
     case = make_case(number, fault, cameras)
-    return case, examine(case.rig, from_detections(case.seen, case.rig, case.frames), fps=FPS)
+    sightings = from_detections(case.seen, case.rig, case.frames)
+    return case, examine(case.rig, sightings, fps=FPS)
 
 
-# Few frames of three small drones indoors; one small drone; one large lopsided body with three cameras.
-SOUND = [8, *(pytest.param(number, marks=SLOW) for number in (3, 4, 6))]
-
-
-@pytest.mark.parametrize("number", SOUND)
+# Few frames of three small drones indoors; one large lopsided body with three cameras.
+@pytest.mark.parametrize("number", [8, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_sound_rig_is_left_alone(number):
-    assert diagnosed(number)[1].findings == ()
+    _, diagnosis = diagnosed(number)
+    assert diagnosis.findings == ()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "fault", "cameras"),
     [
-        (4, "late 0.5", None),
         (4, "exchanged", 3),
         (5, "turned 1", None),
         (0, "millimetres", None),
@@ -288,13 +269,21 @@ def small_problem():
     rig = ring_rig(4, coefficients=5, image_size_wh=(1920, 1080))
     point_m = rng.uniform((-1, -1, 0.5), (1, 1, 2), (10, 3))
     velocity_m = rng.normal(0, 0.05, (10, 3))
-    centre_px = project(rig.cameras, point_m[:, None])[0] + rng.normal(0, 2.0, (10, 4, 2))
-    centre_px[3, 2] = np.nan
-    side_px = np.where(np.isfinite(centre_px[..., 0]), rng.uniform(20, 60, (10, 4)), np.nan)
-    whole = np.zeros((10, 4)), np.ones((10, 4)), np.ones(4)
-    piece = np.repeat([0, 1], 5)
-    points = CommonPoints(np.arange(10), piece, point_m, velocity_m, centre_px, side_px, *whole)
-    weight = np.where(np.isfinite(side_px), rng.uniform(0.3, 1.0, side_px.shape), 0.0)
+    centre_px = project_points(rig, point_m) + rng.normal(0, 2.0, (10, 4, 2))
+    side_px = rng.uniform(20, 60, (10, 4))
+    weight = rng.uniform(0.3, 1.0, (10, 4))
+    centre_px[3, 2], side_px[3, 2], weight[3, 2] = np.nan, np.nan, 0.0
+    points = CommonPoints(
+        np.arange(10),
+        np.repeat([0, 1], 5),
+        point_m,
+        velocity_m,
+        centre_px,
+        side_px,
+        np.zeros((10, 4)),
+        np.ones((10, 4)),
+        np.ones(4),
+    )
     return rig, WeightedPoints(points, point_m, weight)
 
 
@@ -303,53 +292,60 @@ def test_derivatives_are_those_of_finite_differences():
     at = Corrected(rig, np.array([0.3, 0.0, -1.0, 2.0]))
     slopes = linearise(at, data.points, data.position_m)
     for column, step in enumerate(1e-6 * np.eye(PER_CAMERA * 4 + 1)):
-        ahead, behind = (
-            linearise(at.by(sign * step), data.points, data.position_m).residual_px for sign in (1, -1)
-        )
-        expected = np.where(np.isfinite(ahead), slopes.by_parameter[..., column], 0.0)
-        np.testing.assert_allclose(np.nan_to_num(behind - ahead) / 2e-6, expected, rtol=1e-4, atol=1e-3)
+        ahead = linearise(at.by(step), data.points, data.position_m)
+        behind = linearise(at.by(-step), data.points, data.position_m)
+        found = (behind.residual_px - ahead.residual_px) / 2e-6
+        seen = np.isfinite(found)
+        expected = slopes.by_parameter[..., column]
+        np.testing.assert_allclose(found[seen], expected[seen], rtol=1e-4, atol=1e-3)
 
 
 def test_the_evidence_is_that_of_the_dense_normal_distribution():
     """The same marginal likelihoods from the covariance of all pixels, with points of a wide prior distribution."""
     rig, data = small_problem()
-    points, at = data.points, Corrected(rig, np.zeros(4))
-    hypothesis = next(
-        each for each in evidence.list_hypotheses(4, range(4)) if (each.kind, each.camera) == ("turned", 1)
-    )
+    points = data.points
+    at = Corrected(rig, np.zeros(4))
     gathered = evidence.gather(at, data)
-    std = gathered.prior_std
+    hypotheses = evidence.list_hypotheses(4, range(4))
+    (hypothesis,) = [each for each in hypotheses if each.kind == "turned" and each.camera == 1]
     found = gathered.judge(hypothesis, gathered.as_sound).log_odds
 
+    # A row for each coordinate of a sighting.
+    point, camera = np.nonzero(data.weight > 0)
+    point, camera = np.repeat(point, 2), np.repeat(camera, 2)
+    axis = np.tile([0, 1], len(point) // 2)
     slopes = linearise(at, points, data.position_m)
-    rows = np.argwhere(np.repeat((data.weight > 0)[..., None], 2, axis=-1))
-    e = np.array([slopes.residual_px[tuple(row)] for row in rows])
-    same_point = rows[:, None, 0] == rows[None, :, 0]
-    by_point = np.array([slopes.by_point[tuple(row)] for row in rows])
-    base = np.where(same_point, 4.0 * by_point @ by_point.T, 0.0)
-    base += np.diag([1 / data.weight[p, c] for p, c, _ in rows])
-    same = (rows[:, None, 1:] == rows[None, :, 1:]).all(axis=-1)
-    piece = points.piece[rows[:, 0]]
-    side = np.array([points.side_px[p, c] for p, c, _ in rows])
-    floor = np.hypot(side, evidence._SMALL_BOX_PX)
+    residual_px = slopes.residual_px[point, camera, axis]
+    by_point = slopes.by_point[point, camera, axis]
+    same_point = point[:, None] == point
+    white = np.where(same_point, 4.0 * by_point @ by_point.T, 0.0)
+    white += np.diag(1 / data.weight[point, camera])
+    same_axis = (camera[:, None] == camera) & (axis[:, None] == axis)
+    piece = points.piece[point]
+    same_piece = same_axis & (piece[:, None] == piece)
+    side_px = points.side_px[point, camera]
+    floor_px = np.hypot(side_px, evidence._SMALL_BOX_PX)
+    of_floor = np.where(same_piece, np.outer(floor_px, floor_px), 0.0)
+    # An error that changes linearly over the image.
     image = (points.centre_px - rig.cameras.K[:, :2, 2]) / (rig.cameras.image_size_wh / 2)
-    over = np.array([[1.0, *image[p, c]] for p, c, _ in rows])
-    theta = np.array([slopes.by_parameter[tuple(row)][list(hypothesis.columns)] for row in rows])
-    theta = np.where((rows[:, 1] == 1)[:, None], theta, 0.0)
-    logs: dict[str, list[float]] = {"sound": [], "turned": []}
+    over = np.column_stack([np.ones(len(point)), image[point, camera]])
+    smooth = np.where(same_axis, over @ over.T, 0.0)
+    of_side = smooth * np.outer(side_px, side_px)
+    columns = list(hypothesis.columns)
+    turn = slopes.by_parameter[point, camera, axis][:, columns] * gathered.prior_std[columns]
+    turn[camera != 1] = 0.0
+
+    as_sound, as_turned = [], []
     sizes = product(evidence._PIECE_ERRORS, evidence._CAMERA_ERRORS, evidence._CALIBRATION_PX)
     for of_piece, of_camera, of_calibration in sizes:
         rare = evidence._RARE * ((of_camera > 0.1) + (of_calibration > 0.7))
-        shared = np.where(piece[:, None] == piece, np.outer(floor, floor), 0.0)
-        covariance = base + np.where(same, shared * of_piece**2, 0.0)
-        smooth = over @ over.T
-        covariance += np.where(same, smooth * (of_camera**2 * np.outer(side, side) + of_calibration**2), 0.0)
-        logs["sound"].append(rare + multivariate_normal.logpdf(e, cov=covariance))
+        covariance = white + of_piece**2 * of_floor + of_camera**2 * of_side + of_calibration**2 * smooth
+        as_sound.append(rare + multivariate_normal.logpdf(residual_px, cov=covariance))
         for factor in evidence._PRIOR_FACTORS:
-            wide = theta * factor * std[list(hypothesis.columns)]
-            logs["turned"].append(rare + multivariate_normal.logpdf(e, cov=covariance + wide @ wide.T))
-    expected = np.logaddexp.reduce(logs["turned"]) - np.log(len(evidence._PRIOR_FACTORS))
-    expected -= np.logaddexp.reduce(logs["sound"])
+            wide = covariance + factor**2 * turn @ turn.T
+            as_turned.append(rare + multivariate_normal.logpdf(residual_px, cov=wide))
+    expected = np.logaddexp.reduce(as_turned) - np.log(len(evidence._PRIOR_FACTORS))
+    expected -= np.logaddexp.reduce(as_sound)
     assert found == pytest.approx(expected, abs=0.01)
 
 
@@ -358,15 +354,17 @@ def test_sightings_that_agree_by_chance_do_not_go_on_from_frame_to_frame(monkeyp
     rig, data = small_problem()
 
     def consistent(points):
-        return weigh(Corrected(rig, np.zeros(4)), points).used.sum() / points.seen.sum()
+        used = weigh(Corrected(rig, np.zeros(4)), points).used
+        return used.sum() / points.seen.sum()
 
     assert consistent(data.points) > 0.9
-    jumps_px = np.random.default_rng(1).standard_t(1, data.points.centre_px.shape) * 40
-    spots = replace(data.points, centre_px=data.points.centre_px + jumps_px)
+    centre_px = data.points.centre_px
+    jumps_px = 40 * np.random.default_rng(1).standard_t(1, centre_px.shape)
+    spots = replace(data.points, centre_px=centre_px + jumps_px)
     # The scale of the noise is the median's, so that the far tenth of these jumps are outliers.
     assert consistent(spots) < 0.85
     monkeypatch.setattr("psotrack.calibration.doctor.examination.MIN_CONSISTENT", 1.01)
-    (finding,) = diagnosed(4, "late 0.5")[1].findings
+    (finding,) = FEW.examined(turned(RIG, 2, (0, 1, 0))).findings
     assert finding.kind == "too little seen"
     assert "agree by chance" in finding.message
 
@@ -384,13 +382,16 @@ def test_the_command(run_psotrack, tmp_path):
     assert repr(found) == "Diagnosis(nothing disagrees)"
     assert "detections/frame" in found._repr_html_()
 
-    folder = record_detections(tmp_path / "with_centres", INDOORS.seen, FAULTS["centres"][0])
+    wrong, *_ = FAULTS["centres"]
+    folder = record_detections(tmp_path / "with_centres", INDOORS.seen, wrong)
     done = run_psotrack("doctor", folder, "-q")
-    assert (done.code, done.out.count("\n")) == (1, 1)
+    assert done.code == 1
+    assert done.out.count("\n") == 1
     assert "write t = -R C" in done.out
     done = run_psotrack("doctor", folder, "--json", "-")
     assert done.code == 1
     content = json.loads(done.out)
-    assert json.loads(json.dumps(pt.doctor(folder).to_dict())) == content
+    found = pt.doctor(folder).to_dict()
+    assert json.loads(json.dumps(found)) == content
     assert [finding["kind"] for finding in content["findings"]] == ["translation or centre"]
     assert [row["camera"] for row in content["cameras"]] == list(RIG.names)

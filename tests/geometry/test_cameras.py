@@ -1,14 +1,14 @@
-"""Cameras and their lenses: OpenCV's projections are the oracles, also for where a lens folds; and rotations."""
+"""Cameras and their lenses, with OpenCV as the oracle, also for where a lens folds; rotations; views that meet."""
 
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import float32, move_world, sphere_points
+from board_rigs import record_detections
+from helpers import assert_refused, float32, make_unnamed_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -27,7 +27,10 @@ from psotrack.geometry import (
     sizes_px,
     undistort,
     undistortion_stretch,
+    views_meet,
 )
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import Detections
 
 SIZE_WH = (1920, 1080)
 K = np.array([[1050.0, 0.0, 965.0], [0.0, 1043.0, 532.0], [0.0, 0.0, 1.0]])
@@ -204,22 +207,6 @@ def test_rigs_mix_lens_models():
     assert len(jax.tree.leaves(alone.cameras)) == 4
 
 
-three = partial(st.lists, min_size=3, max_size=3)
-
-
-@given(three(st.floats(-np.pi, np.pi)), three(st.floats(-10, 10)))
-def test_moving_world_and_rig_together_changes_no_pixel(turn, shift_m):
-    rig = mixed_rig()
-    R = Rotation.from_rotvec(turn).as_matrix()
-    pixels, depth_m = project(rig.cameras, POINTS_M[:, None])
-    moved = move_world(rig, R, shift_m)
-    moved_m = POINTS_M @ R.T + shift_m
-    pixels_moved, depth_moved_m = project(moved.cameras, moved_m[:, None])
-    # Shifts of 10 m cost one or two of float64's sixteen digits.
-    np.testing.assert_allclose(pixels_moved, pixels, atol=1e-9)
-    np.testing.assert_allclose(depth_moved_m, depth_m, atol=1e-12)
-
-
 @pytest.mark.parametrize("centre_m", [(4.0, 0.0, 2.0), (-1.0, 3.0, 0.5), (0.1, 0.0, 9.0)])
 def test_look_at(centre_m):
     target_m = (0.0, 0.2, 1.0)
@@ -305,3 +292,75 @@ def test_undistorting_stretches_small_circles(name):
     expected = np.sqrt(squares.mean(axis=-1)) / 1e-4
     found = undistortion_stretch(lens, points[:, 0, :2])
     np.testing.assert_allclose(found, expected, rtol=5e-3)
+
+
+# Views that meet, and rigs in whose common view no drone can be found.
+
+FRAMES = 40
+
+
+def looking(centre_m, target_m, focal_px=1000.0, dist=()):
+    R, t_m = look_at(centre_m, target_m)
+    K = np.array([[focal_px, 0, 960], [0, focal_px, 540], [0, 0, 1]])
+    return make_camera(R=R, t_m=t_m, K=K, dist=dist, image_size_wh=(1920, 1080))
+
+
+def rig_of(centres_m, targets_m, **lens):
+    """Cameras at places that look at targets."""
+    cameras = [looking(*look, **lens) for look in zip(centres_m, targets_m, strict=True)]
+    return make_unnamed_rig(*cameras)
+
+
+def around(target_m):
+    centres_m = [(6, 0, 3), (-2, 5, 2), (-3, -5, 4)]
+    return rig_of(centres_m, [target_m] * 3)
+
+
+#: Cameras beside each other that look away from each other, with lenses that distort.
+ANGLE = np.array([0.0, 2.1, 4.2])
+DIRECTIONS = np.stack([np.cos(ANGLE), np.sin(ANGLE), np.zeros(3)], axis=-1)
+#: Cameras beside each other that look away from each other, with lenses that distort.
+OUTWARDS = rig_of(DIRECTIONS, 9 * DIRECTIONS, focal_px=3000.0, dist=(-0.2, 0.05, 0.0, 0.0))
+#: Two cameras 100 m away from the middle, with images of 3 m there.
+FAR_M = [(-100, 0, 1), (0, -100, 1)]
+#: What it shows -> a rig, and whether views of its cameras meet.
+#: What it shows -> a rig, and whether views of its cameras meet.
+RIGS = {
+    "around": (around((0.0, 0.0, 1.5)), True),
+    "side by side": (rig_of([(0, 0, 1), (4, 0, 1)], [(0, 9, 1), (4, 9, 1)]), True),
+    "back to back": (rig_of([(0, 1, 1), (0, -1, 1)], [(0, 9, 1), (0, -9, 1)]), False),
+    "far": (rig_of(FAR_M, [(0, 0, 1), (0, 0, 1)], focal_px=6e4), True),
+    "far, at two heights": (rig_of(FAR_M, [(0, 0, 1), (0, 0, 21)], focal_px=6e4), False),
+    "outwards": (OUTWARDS, False),
+}
+
+
+@pytest.mark.parametrize(("rig", "meet"), RIGS.values(), ids=RIGS)
+def test_whether_views_meet(rig, meet):
+    assert views_meet(rig.cameras) == meet
+
+
+@pytest.mark.slow
+def test_tracks_from_cameras_that_stand_elsewhere_than_stated_are_refused(run_psotrack, tmp_path):
+    """Detections by cameras that look at a room, with the calibration of cameras that look elsewhere."""
+    folder = tmp_path / "recording"
+    true = around((0.0, 0.0, 1.5))
+    time_s = np.arange(FRAMES)[:, None] / 25.0 + 3.0 * np.arange(2)
+    truth_m = np.stack([np.sin(time_s), np.cos(1.3 * time_s), 1.5 + 0.4 * np.sin(2 * time_s)], axis=-1)
+    frame = np.repeat(np.arange(FRAMES), 2)
+    seen = {}
+    for index, name in enumerate(true.names):
+        centre_px, _ = project(true.cameras[index], truth_m.reshape(-1, 3))
+        boxes = np.concatenate([centre_px - 5.5, centre_px + 6.5], axis=1)
+        seen[name] = Detections(frame, boxes, np.ones(len(frame)))
+    record_detections(folder, seen, OUTWARDS)
+    words = ("track", folder, "--method", "projection-lines", "--out", folder / "tracks.csv")
+
+    def track():
+        return run_psotrack(*words, "--cache", tmp_path / "cache")
+
+    expected = "expected cameras of which two have a place in view together"
+    assert_refused(track, expected, "found that no views of 0, 1, 2 meet", unchanged=folder)
+    write_rig(folder / "rig.toml", around((0.0, 0.9, 2.5)), force=True)
+    expected = f"detections of different cameras that meet in a place in 0 of {FRAMES} frames"
+    assert_refused(track, expected, f"`psotrack doctor {folder}`", unchanged=folder)

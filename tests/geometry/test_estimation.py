@@ -1,15 +1,13 @@
-"""Estimation: least squares are compared with SciPy and dense algebra, the backward pass with one joint Gaussian."""
+"""Estimation: least squares are compared with SciPy and dense algebra."""
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from psotrack.geometry.estimation import (
     NormalEquations,
-    backward_step,
     cauchy_loss,
     cauchy_weight,
     covariance_from_information,
@@ -88,28 +86,22 @@ def test_a_fit_equals_scipys(robust):
     assert found.cost == pytest.approx(2 * expected.cost, rel=1e-9)
 
 
-def test_no_step_raises_a_cost():
-    starts = np.random.default_rng(3).uniform((0, 0.1, -1), (5, 2, 1), (20, 3))
-    for params, values in zip(starts, measured_curves(20), strict=True):
-        state = Curves(params, values)
-        for steps in (1, 2, 3, 5, 8):
-            after = levenberg_marquardt(state, max_steps=steps)
-            assert after.cost <= state.cost
-            state = after
-
-
 def coupled_equations(blocks=5, m=3, n=4):
     """Normal equations with blocks, and the same equations as a dense matrix and its right side."""
-    rng, cut = np.random.default_rng(5), blocks * m
-    J = np.zeros((blocks, 10, cut + n))
+    rng = np.random.default_rng(5)
+    cut = blocks * m
     diagonal = [slice(k * m, k * m + m) for k in range(blocks)]
+    J = np.zeros((blocks, 10, cut + n))
+    J[..., cut:] = rng.normal(size=(blocks, 10, n))
     for rows, columns in zip(J, diagonal, strict=True):
-        rows[:, columns], rows[:, cut:] = rng.normal(size=(10, m)), rng.normal(size=(10, n))
+        rows[:, columns] = rng.normal(size=(10, m))
     J = J.reshape(10 * blocks, cut + n)
-    A, b = J.T @ J, J.T @ rng.normal(size=10 * blocks)
+    A = J.T @ J
+    b = J.T @ rng.normal(size=10 * blocks)
     own = np.stack([A[rows, rows] for rows in diagonal])
     between = A[:cut, cut:].reshape(blocks, m, n)
-    return NormalEquations(A[cut:, cut:], b[cut:], own, b[:cut].reshape(blocks, m), between), A, b
+    equations = NormalEquations(A[cut:, cut:], b[cut:], own, b[:cut].reshape(blocks, m), between)
+    return equations, A, b
 
 
 def test_elimination_of_blocks_gives_the_dense_solution_and_covariance():
@@ -132,34 +124,3 @@ def test_an_undetermined_unknown_has_no_covariance_and_is_not_moved():
         covariance_from_information(nearly, largest_inflation=1e6)
     step = NormalEquations(information, np.array([2.0, 0.0])).damped(1e-9).solved()
     np.testing.assert_allclose(step.shared, [0.5, 0.0], rtol=1e-8)
-
-
-@pytest.mark.parametrize("xp", [np, jnp])
-def test_the_backward_step_conditions_on_the_next_frame(xp):
-    """The smoothed first of two frames is the Gaussian conditioned on a measurement of the second frame.
-
-    A component without variance, and without a transition into other components, is not changed.
-    """
-    rng = np.random.default_rng(9)
-    n = 4
-    root, noise_root, F = rng.normal(size=(n, n)), rng.normal(size=(n, n)), rng.normal(size=(n, n))
-    P, Q = root @ root.T, noise_root @ noise_root.T
-    for matrix in (P, Q, F):
-        matrix[3], matrix[:, 3] = 0.0, 0.0
-    F[3, 3] = 1.0
-    H, R, z = rng.normal(size=(2, n)), np.eye(2), np.array([1.0, -2.0])
-    predicted = F @ P @ F.T + Q
-    gain = predicted @ H.T @ np.linalg.inv(H @ predicted @ H.T + R)
-    later_mean, later_P = gain @ z, predicted - gain @ H @ predicted
-    H_now = H @ F
-    S = H_now @ P @ H_now.T + H @ Q @ H.T + R
-    gain_now = P @ H_now.T @ np.linalg.inv(S)
-    change, covariance = backward_step(
-        *(xp.asarray(part) for part in (P, F, Q, predicted, later_P, later_mean[:, None]))
-    )
-    # JAX computes in float32 here.
-    tolerance = 1e-10 if xp is np else 1e-3
-    np.testing.assert_allclose(change[:, 0], gain_now @ z, atol=tolerance)
-    np.testing.assert_allclose(covariance, P - gain_now @ H_now @ P, atol=tolerance)
-    np.testing.assert_array_equal(np.asarray(covariance)[3], 0.0)
-    np.testing.assert_array_equal(covariance, np.asarray(covariance).T)
