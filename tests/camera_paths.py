@@ -34,6 +34,42 @@ def camera_path(position_m, rotation, covariance, *, first_s=0.0, num_markers=8)
     )
 
 
+def orientations(path: CameraPath) -> Rotation:
+    """The orientations of all frames, where a frame without a pose counts as not turned."""
+    wxyz = np.where(path.seen[:, None], path.orientation_wxyz, [1.0, 0.0, 0.0, 0.0])
+    return Rotation.from_quat(wxyz, scalar_first=True)
+
+
+def distances_m(path: CameraPath, position_m):
+    """Distances from the true positions, NaN without a pose."""
+    return np.linalg.norm(path.position_m - position_m, axis=1)
+
+
+def pose_errors(path: CameraPath, position_m, rotation):
+    """True minus estimated poses (frames, 6) in the covariance's order: along the world's axes, about the camera's."""
+    turn = orientations(path).inv() * rotation
+    return np.concatenate([position_m - path.position_m, turn.as_rotvec()], axis=1)
+
+
+def squared_errors(error, covariance):
+    """Squared Mahalanobis distances (n,) of errors (n, size), by covariances of as many numbers or of more."""
+    size = error.shape[1]
+    solved = np.linalg.solve(covariance[:, :size, :size], error[..., None])
+    return np.vecdot(error, solved[..., 0])
+
+
+def in_other_world(path: CameraPath, turn: Rotation, shift_m) -> CameraPath:
+    """The path with its poses in a world that is turned and shifted."""
+    by_world = np.eye(6)
+    by_world[:3, :3] = turn.as_matrix()
+    return replace(
+        path,
+        position_m=turn.apply(path.position_m) + shift_m,
+        orientation_wxyz=(turn * orientations(path)).as_quat(scalar_first=True),
+        covariance=by_world @ path.covariance @ by_world.T,
+    )
+
+
 def remove_poses(path: CameraPath, rows) -> CameraPath:
     """The path with the poses of some frames lost."""
     names = ("position_m", "orientation_wxyz", "covariance", "ambiguity", "reprojection_px")
