@@ -3,8 +3,6 @@
 import re
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from unittest import mock
 
 import cv2
 import numpy as np
@@ -35,7 +33,6 @@ from psotrack.inside_out import (
     PoseSettings,
     build_map,
     check_map,
-    corners_in_own_frame,
     fuse,
     open_source,
     read_camera_path,
@@ -129,42 +126,37 @@ def opens_images_of_two_sizes(folder, run):
     return lambda: list(open_source(folder, fps=25.0).frames())
 
 
-def opens_folder_that_is_not_readable(folder, run):
-    def call():
-        # Tests may run as root, and root may read every folder.
-        with mock.patch.object(Path, "iterdir", side_effect=PermissionError(13, "Permission denied")):
-            open_source(folder)
-
-    return call
-
-
 def third(corners):
     """The table of the room with other corners of marker 3, in line 4."""
     return wide_table({**ROOM, 3: corners})
 
 
 def bent(distance_m, axis):
-    return ROOM[3] + distance_m * np.outer(np.arange(4) == 2, np.arange(3) == axis)
+    """Marker 3 with one corner beside its place."""
+    corners = ROOM[3].copy()
+    corners[2, axis] += distance_m
+    return corners
 
 
 WIDE = wide_table(ROOM)
 LONG = long_table(ROOM, ["id", "corner", "x_m", "y_m", "z_m"])
 CELLS = WIDE.splitlines()[3].split(";")
 MIRRORED = wide_table({marker: corners * [1.0, -1.0, 1.0] for marker, corners in ROOM.items()})
-IN_MILLIMETRES = wide_table({marker: 1e3 * corners for marker, corners in ROOM.items()})
 CORNERS_OF_3 = tuple(f"Marker3:{corner}" for corner in range(1, 5))
-UNSEEN_M = np.where(np.arange(4)[:, None] == 1, np.nan, np.ones((5, 4, 3)))
-TEN_COLUMNS = "\n".join(";".join(line.split(";")[:10]) for line in WIDE.splitlines())
+UNSEEN_M = np.ones((5, 4, 3))
+UNSEEN_M[:, 1] = np.nan
+TEN_COLUMNS = "\n".join(line.rsplit(";", 3)[0] for line in WIDE.splitlines())
 NEGATIVE_STD = re.sub("(?m)$", ";-2", WIDE.rstrip()).replace("4[m];-2", "4[m];std[mm]")
 THREE_ROWS = re.sub("\n3,3,.*", "", LONG)
-SAME_CENTRE = "id,x_m,y_m,z_m\n3,1,2,0.5\n4,1,2,0.5\n"
 TRACKS = "frame,time_s,drone,x_m,y_m,z_m\n0,0,a,1,2,3\n"
 CENTRES_TWICE = "id,x_m,y_m,z_m\n3,1,2,0.5\n3,1.5,2,0.5\n"
 
 
 def with_cells(cells):
     """The table with other cells of marker 3, in line 4."""
-    return reads(WIDE.replace(";".join(CELLS), ";".join(cells)))
+    lines = WIDE.splitlines()
+    lines[3] = ";".join(cells)
+    return reads("\n".join(lines))
 
 
 def in_frames(*ids):
@@ -188,7 +180,6 @@ NOWHERE = np.full((4, 4, 2), np.nan), np.ones((4, 4, 3)), DRAWN_LENS
 BAD = {
     # Tables of markers.
     "empty cell": (with_cells([*CELLS[:5], "", *CELLS[6:]]), "line 4, column y2[m]", "found nothing"),
-    "empty last cell": (with_cells([*CELLS[:-1], ""]), "line 4, column z4[m]", "found nothing"),
     "three corners": (with_cells(CELLS[:10]), "line 4: expected 13 values, found 10; "),
     "no fourth corner": (reads(TEN_COLUMNS), "expected a column x4, found only"),
     "three rows": (reads(THREE_ROWS), "line 10 to 12, marker 3", "found none of number 3; add"),
@@ -208,43 +199,35 @@ BAD = {
     "crossed": (reads(third(ROOM[3][[0, 1, 3, 2]])), "line 4, marker 3", "one after the other"),
     "same place": (reads(third(ROOM[2] + 0.01)), "line 4, marker 3", "both markers at the place of marker 2"),
     "one in mm": (reads(third(1e3 * ROOM[3])), "line 4, marker 3", "found 400 m; is it in mill", "x1[mm]"),
-    "all in mm": (reads(IN_MILLIMETRES), "line 2, marker 1: ", "found 400 m; is it in millimetres"),
     "mirrored": (reads(MIRRORED), "16 of 16 markers face out of the room", "an axis is mirrored"),
     "not finite": (calls(MarkerMap, {5: np.full((4, 3), np.nan)}), "marker 5: expected finite corners"),
     "no markers": (calls(MarkerMap, {}), "at least one marker"),
     "centre twice": (reads(CENTRES_TWICE, read_marker_table), "line 3, column id", "once, found 3 again"),
-    "same centre": (reads(SAME_CENTRE, read_marker_table), "centre of marker 3 for marker 4 as well"),
     "unseen corner": (reads_c3d(CORNERS_OF_3, UNSEEN_M), "room.c3d, marker 3: ", "number 2 is never seen"),
     "labels of drones": (reads_c3d(("Dron1:Dron11",), np.ones((5, 1, 3))), "Marker7:1", "found Dron1"),
     # Maps from videos and from centres.
     "no frames": (calls(in_frames), "expected frames that show markers, found none in any frame"),
     "unseen known": (calls(build_map, in_frames(1, 2), {77: ROOM[7]}), "77 beside others, found only 1"),
     "known alone": (calls(build_map, in_frames(7), {7: ROOM[7]}), "in no frame; name another one by --known"),
-    "no side": (calls(corners_in_own_frame, 0.0), "side_m: expected a number above 0"),
     "no two of a map": (calls(check_map, in_frames(1, 2), MarkerMap({9: ROOM[1]})), "two markers of the map"),
     "three centres": (calls(complete_map, THREE, CENTRES, PASSING_CAMERA), "expected 4 markers", "found 3"),
     # Paths of cameras.
     "unknown flag": (reads_path(flags="few"), "line 2, column flags: ", "few_markers"),
     "unknown status": (reads_path(status="gone"), "line 2: expected one of ", "coasting", "in status"),
     "another drone": (reads_path(drone="dron3"), "path.csv: ", "one drone"),
-    "no length": (reads_path(qw="1e-320", qx="0", qy="0", qz="0"), "a unit quaternion", "found length 0"),
     "length 3": (reads_path(qw="0", qx="3", qy="0", qz="0"), "line 2", "in qw, qx, qy, qz, found length 3"),
     "negative variance": (reads_path(cov_zz="-9e8"), "line 2: expected a covariance in cov_xx, "),
     "no covariance": (reads_path(cov_xa="1e9"), "line 2, column cov_xx: ", "in cov_xx to cov_cc"),
     "no time": (reads_path(time_s=""), "line 2: expected a time_s"),
-    "time again": (reads_path(time_s="0.04"), "line 3: expected a time after 0.04 s"),
     "no orientations": (reads(TRACKS, read_camera_path), "orientations"),
     # Poses, their settings, and the filter.
     "no coordinates": (calls(estimate_pose, *NOWHERE, PoseSettings()), "finite coordinates"),
     "min_markers": (calls(PoseSettings, min_markers=0), "min_markers: expected at least 1, found 0"),
     "focal_error": (calls(PoseSettings, focal_error=-0.1), "a number from 0 to below 1, found -0.1"),
-    "map_error_m": (calls(PoseSettings, map_error_m=np.nan), "a number from 0 to below 1, found nan"),
     "scale": (calls(CornerNoise, scale=0.0), "scale"),
-    "place_m": (calls(CornerNoise, place_m=np.inf), "place_m"),
     "false_alarm": (calls(PoseFilterParams, false_alarm=0.0), "a probability above 0 and below 1, found 0"),
     "longest_gap_s": (calls(PoseFilterParams, longest_gap_s=-1.0), "a number above 0, found -1"),
     "confirm": (calls(PoseFilterParams, confirm=0), "confirm: expected at least 1, found 0"),
-    "restart_after": (calls(PoseFilterParams, restart_after=0), "expected at least 1, found 0"),
     "earlier frame": (calls(STEPPED, BEGUN, 0.0, poses_of(PATH)[1]), "a time after 0.04 s, found 0 s"),
     "no error": (calls(smooth, UNSURE), "covariance at 0 s: expected a positive definite matrix"),
     # Fusion.
@@ -255,29 +238,24 @@ BAD = {
     "fused into text": (fuses("{dron1} {tracks} --out {tmp}/a.txt"), "expected a file that ends in .csv"),
     "path twice": (fuses("{dron1} {dron1} {tracks}"), "a second path of dron1"),
     "tracks for a path": (fuses("{tracks} {tracks}"), "a camera's path with orientations"),
-    "negative range": (fuses("{dron1} {tracks} --max-offset -1"), "expected a number above 0, found -1"),
     "later": (fuses("{dron1} {later}"), "later.csv: ", "0.00 to 3.96 s of dron1, found 100.00 to 103.96 s; "),
     # Lenses, images, and detection.
     "another shape": (reads_lens((1920, 1080), name="left", scale=True), "640 x 480; ", "the shape differs"),
     "large images": (reads_lens((1280, 960), name="left"), "lens.toml", "for 1280 x 960", "--scale-camera"),
     "axis off": (reads_lens_without_size, "for 1920 x 1080", "an optical axis at (320, 240)"),
     "several lenses": (reads_lens((640, 480)), "one camera, found left, right; name it by --camera-name"),
-    "no such lens": (reads_lens((640, 480), name="up"), "expected a camera up, found left, right"),
     "two sizes": (opens_images_of_two_sizes, "a1.png: expected 30 x 20 pixels as in a0.png, found 32 x 20"),
-    "unreadable folder": (opens_folder_that_is_not_readable, "folder to read, found permission denied"),
-    "no stream": (calls(open_source, "file:///nowhere.avi"), "nowhere.avi: expected a camera or a stream"),
+    "no stream": (calls(open_source, "file:///nowhere.avi"), "a stream, found none that can be opened"),
     "no dictionary": (calls(MarkerDetector, "9x9"), "dictionary: expected one of ", "4x4_1000", "found 9x9"),
     "not in it": (calls(MarkerDetector, "4x4_50", ids=[50]), "markers of the map, found 4x4_50, 0 to 49"),
     # The command `onboard localise`.
     "no lens": (localises("", lens=""), "lens: expected --camera FILE or --fov H,V, found neither"),
-    "two lenses": (localises("--camera {lens}"), "lens: ", "found both"),
     "sides of corners": (localises("--marker-size 0.3"), "a table of centres alone, found corners in"),
     "frames": (localises("--frames 99"), "frames: expected 1 to 14, the frames of ", "avi, found 99"),
     "drone": (localises("--drone dron1"), "--drone: expected a folder with videos of drones' own"),
     "number": (localises("", "0"), "0: expected a video, ", "pass --live if it is a camera's number"),
     "one output": (localises("--json {new}"), "--json: expected another file than --out"),
     "no rate": (localises("", "{images}"), "--fps: expected the rate at which ", "such as --fps 25"),
-    "one image": (localises("", "{images}/frame0.png"), "frame0.png: expected a video, or a folder"),
     "no images": (localises("", "{tmp}"), "images, which end in .png", "found neither; to use"),
     "readout nan": (localises("--readout nan"), "--readout: expected 0 to"),
     "long readout": (localises("--readout 0.05"), "between two frames at 25 frames per second, found 0.05"),
@@ -285,13 +263,8 @@ BAD = {
     "build and check": (maps("--out {new} --check {corners}"), "--check MAP, found both"),
     "no known": (maps("--out {new}"), "expected numbers of markers that are known"),
     "no place": (maps("--out {new} --known 17"), "--markers with the corners of the known"),
-    "two and a side": (maps("--out {new} --known 17,8 --side 0.3"), "found no --markers"),
     "not in table": (maps("--out {new} --known 9 --markers {corners}"), "expected the known marker 9"),
-    "no lens of it": (maps("--out {new} --known 17 --side 0.3"), "--camera FILE or --fov H,V, found nei"),
-    "negative side": (maps("--out {new} --known 17 --side -1"), "--side: expected a number above 0"),
     "video as map": (maps("--check {flight}"), "flight.avi: expected UTF-8 text"),
-    "drone of a video": (maps("--drone dron1 --check {corners}"), "expected a sequence's folder as SOURCE"),
-    "dictionary": (maps("--check {corners} --fov 70,55 --dictionary 5x5_50 --frames 3"), "found none"),
 }
 
 
