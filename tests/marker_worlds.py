@@ -45,33 +45,47 @@ def posed(lens, centre_m, target_m):
 def marker_at(centre_m, front, turn_deg=0.0, *, side_m=0.3):
     """Corners (4, 3) of a marker whose front looks along `front`, turned in its plane, metres."""
     front = np.array(front, float) / np.linalg.norm(front)
-    beside = np.cross([0, 0, 1.0] if abs(front[2]) < 0.9 else [0, 1.0, 0], front)
+    above = np.array([0, 0, 1.0])
+    if abs(front[2]) >= 0.9:
+        above = np.array([0, 1.0, 0])
+    beside = np.cross(above, front)
     beside /= np.linalg.norm(beside)
     axes = np.stack([beside, np.cross(front, beside), front])
-    spin = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
-    return np.array(centre_m, float) + side_m * SQUARE @ spin.T @ axes
+    spin = Rotation.from_euler("z", turn_deg, degrees=True)
+    return np.array(centre_m, float) + side_m * spin.apply(SQUARE) @ axes
+
+
+#: Where the front of a marker looks.
+EAST, WEST, NORTH, SOUTH = (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)
+UP, DOWN = (0, 0, 1), (0, 0, -1)
 
 
 def four_walls():
     """Four markers of 0.4 m on each wall of a room of 8 x 6 m, at changing heights; ids from 1."""
-    walls = [((0, 3), (0, -1, 0)), ((4, 0), (-1, 0, 0)), ((0, -3), (0, 1, 0)), ((-4, 0), (1, 0, 0))]
     corners = {}
-    for (x, y), inward in walls:
-        for index, along in enumerate((-2.1, -0.7, 0.8, 2.2)):
-            centre_m = (x + along * abs(inward[1]), y + along * abs(inward[0]), 1.2 + 0.5 * (index % 3))
-            corners[len(corners) + 1] = marker_at(centre_m, inward, side_m=0.4)
+    for x, y, inward in ((0, 3, SOUTH), (4, 0, WEST), (0, -3, NORTH), (-4, 0, EAST)):
+        along = np.abs([inward[1], inward[0], 0])
+        for index, shift_m in enumerate((-2.1, -0.7, 0.8, 2.2)):
+            middle_m = np.array([x, y, 1.2 + 0.5 * (index % 3)])
+            corners[len(corners) + 1] = marker_at(middle_m + shift_m * along, inward, side_m=0.4)
     return corners
 
 
 def any_room():
     """Markers on walls, on a pillar in front of a wall, on the floor and on the ceiling, turned any way."""
-    corners = {i: marker_at((-3 + 1.2 * i, 4, 1 + 0.5 * (i % 3)), (0, -1, 0), 37 * i) for i in range(6)}
+    corners = {}
+    for i in range(6):
+        corners[i] = marker_at((-3 + 1.2 * i, 4, 1 + 0.5 * (i % 3)), SOUTH, 37 * i)
     for i in range(5):
-        corners[10 + i] = marker_at((4, -2 + 1.3 * i, 1.2 + 0.4 * (i % 2)), (-1, 0, 0), 90 * i)
-    corners |= {20: marker_at((0.2, 3.2, 1.3), (0, -1, 0)), 21: marker_at((0.5, 3.5, 1.4), (1, 0, 0), 10)}
-    corners |= {22: marker_at((-0.1, 3.5, 1.9), (-1, 0, 0)), 23: marker_at((0.2, 3.8, 1.6), (0, 1, 0), 45)}
-    corners |= {30: marker_at((1.5, 2.5, 0), (0, 0, 1), 20), 31: marker_at((-1.5, 2, 0), (0, 0, 1), 200)}
-    corners |= {40: marker_at((1, 2.5, 3), (0, 0, -1), 70), 41: marker_at((-1, 3, 3), (0, 0, -1))}
+        corners[10 + i] = marker_at((4, -2 + 1.3 * i, 1.2 + 0.4 * (i % 2)), WEST, 90 * i)
+    corners[20] = marker_at((0.2, 3.2, 1.3), SOUTH)
+    corners[21] = marker_at((0.5, 3.5, 1.4), EAST, 10)
+    corners[22] = marker_at((-0.1, 3.5, 1.9), WEST)
+    corners[23] = marker_at((0.2, 3.8, 1.6), NORTH, 45)
+    corners[30] = marker_at((1.5, 2.5, 0), UP, 20)
+    corners[31] = marker_at((-1.5, 2, 0), UP, 200)
+    corners[40] = marker_at((1, 2.5, 3), DOWN, 70)
+    corners[41] = marker_at((-1, 3, 3), DOWN)
     return corners
 
 
@@ -111,12 +125,14 @@ def found_markers(ids, corners_px, std_px=np.nan):
 def whole_markers(corners_m, camera, pixels, depth_m):
     """(markers,), markers whose front and whole border a camera shows at (markers, 4, 2) pixels."""
     front = np.cross(corners_m[:, 3] - corners_m[:, 1], corners_m[:, 2] - corners_m[:, 0])
-    faces = ((camera.centre_world - corners_m.mean(axis=1)) * front).sum(axis=-1) > 0.01
+    to_camera = camera.centre_world - corners_m.mean(axis=1)
+    faces = np.vecdot(to_camera, front) > 0.01
     inside = ((pixels > 0) & (pixels < camera.image_size_wh - 1)).all(axis=(1, 2))
     # The polynomial of the distortion folds back far outside of the image.
-    beside = np.abs((corners_m @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3])[..., :2])
-    narrow = (beside < 1.2 * depth_m[..., None]).all(axis=(1, 2))
-    return faces & inside & narrow & (depth_m > 0.3).all(axis=1)
+    T = camera.T_cam_world
+    x_cam = corners_m @ T[:3, :3].T + T[:3, 3]
+    narrow = np.abs(x_cam[..., :2]).max(axis=-1) < 1.2 * depth_m
+    return faces & inside & (narrow & (depth_m > 0.3)).all(axis=1)
 
 
 def seen_markers(corners_m, camera, rng, noise_px, std_px=np.nan):
@@ -124,7 +140,9 @@ def seen_markers(corners_m, camera, rng, noise_px, std_px=np.nan):
     ids, points_m = np.array(list(corners_m)), np.array(list(corners_m.values()))
     pixels, depth_m = project(camera, points_m)
     seen = whole_markers(points_m, camera, pixels, depth_m)
-    return found_markers(ids[seen], pixels[seen] + noise_px * rng.standard_normal(pixels[seen].shape), std_px)
+    shown_px = pixels[seen]
+    error_px = noise_px * rng.standard_normal(shown_px.shape)
+    return found_markers(ids[seen], shown_px + error_px, std_px)
 
 
 #: A camera that flies past the markers of `any_room`.
@@ -157,20 +175,24 @@ FEW, UNMAPPED = (5, 8, 17), 900
 
 def wall_markers():
     """Nine markers on a wall at y = 4, and four on a wall at x = 3; ids with gaps."""
-    corners = {
-        5 + 3 * i: marker_at((-1.45 + 1.3 * (i % 3), 4, 0.85 + 0.75 * (i // 3)), (0, -1, 0)) for i in range(9)
-    }
+    corners = {}
+    for i in range(9):
+        row, column = divmod(i, 3)
+        corners[5 + 3 * i] = marker_at((-1.45 + 1.3 * column, 4, 0.85 + 0.75 * row), SOUTH)
     for i in range(4):
-        corners[40 + i] = marker_at((3, 2.35 + 0.8 * (i % 2), 1.05 + 0.9 * (i // 2)), (-1, 0, 0))
+        row, column = divmod(i, 2)
+        corners[40 + i] = marker_at((3, 2.35 + 0.8 * column, 1.05 + 0.9 * row), WEST)
     return corners
 
 
 def drawn_cameras():
     """The camera in each frame, which flies to the right, forward and up."""
-    return [
-        posed(DRAWN_LENS, (-0.9 + 0.12 * i, -0.3 + 0.04 * i, 1.2 + 0.04 * i), (0.5 + 0.03 * i, 4.0, 1.5))
-        for i in range(NUM_FRAMES)
-    ]
+    cameras = []
+    for i in range(NUM_FRAMES):
+        centre_m = (-0.9 + 0.12 * i, -0.3 + 0.04 * i, 1.2 + 0.04 * i)
+        target_m = (0.5 + 0.03 * i, 4.0, 1.5)
+        cameras.append(posed(DRAWN_LENS, centre_m, target_m))
+    return cameras
 
 
 def draw_markers(corners_m, camera):

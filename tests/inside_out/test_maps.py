@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from marker_worlds import (
     DRAWN_LENS,
     PASSING_CAMERA,
-    SQUARE,
     any_room,
     column_names,
     fly_past,
@@ -50,7 +49,6 @@ from psotrack.inside_out.lens_files import scale_lens
 from psotrack.inside_out.localising import localise_frames
 from psotrack.inside_out.mapping import complete_map
 from psotrack.inside_out.mapping.sightings import collect_sightings, outward
-from psotrack.inside_out.marker_map import fit_square
 from psotrack.recordings.datasets import read_marker_corners, write_marker_corners
 from psotrack.recordings.mocap import Markers, write_c3d
 
@@ -104,7 +102,6 @@ OURS = wide_table(ROOM)
 LAYOUTS = {
     "ours": OURS,
     "millimetres": wide_table(ROOM, column_names("{axis}{corner}[mm]"), scale=1e3),
-    "centimetres": wide_table(ROOM, column_names("{axis}{corner} (cm)"), scale=1e2),
     "commas": wide_table(ROOM, column_names("{axis}_{corner}"), separator=","),
     "tabs": wide_table(ROOM, column_names("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
     "from 0": wide_table(ROOM, column_names("p{corner}.{axis} [m]", "0123")),
@@ -112,7 +109,6 @@ LAYOUTS = {
     "numbers alone": wide_table(ROOM, None, separator=","),
     "long from 0": long_table(ROOM, ["marker", "corner_id", *"XYZ"], "0123", separator=";"),
     "long with names": long_table(ROOM, ["Marker ID", "corner", *"xyz"], ["Top-left", "TR", "br", "bl"]),
-    "long numbers": long_table(ROOM, None, separator=";"),
     "a spreadsheet's": "\ufeff" + OURS.replace("\n", ";\r\n"),
     "words in ids": OURS.replace("\n", "\nMarker_").removesuffix("Marker_"),
     "other columns": OURS.replace("\n", ";0.3\n").replace("z4[m];0.3", "z4[m];size"),
@@ -157,16 +153,6 @@ def test_maps_of_real_rooms_are_accepted(tmp_path):
 
 
 # Measured corners
-
-
-@given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-9, 9)] * 3), st.floats(0.05, 1.0))
-def test_the_square_fitted_to_a_square_is_the_same_square(turn, centre, side_m):
-    axes = Rotation.from_rotvec(turn).as_matrix()
-    found = fit_square(np.array(centre) + side_m * SQUARE @ axes.T)
-    # Double precision, for numbers up to 10.
-    np.testing.assert_allclose(found.T_world_marker[:3, :3], axes, atol=1e-11 / side_m)
-    np.testing.assert_allclose(found.T_world_marker[:3, 3], centre, atol=1e-11)
-    assert found.side_m == pytest.approx(side_m, rel=1e-9)
 
 
 def recorded_corners(labels="Marker{}:{}", noise_m=0.0):
@@ -340,15 +326,6 @@ def test_wrong_centres_are_left_out():
 @pytest.fixture(scope="module")
 def noisy_sightings():
     return sightings(noise_px=0.3)
-
-
-def test_correct_maps_have_no_findings(noisy_sightings):
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        measured = {marker: corners + 0.001 * rng.standard_normal((4, 3)) for marker, corners in ROOM.items()}
-        checkup = check_map(noisy_sightings, MarkerMap(measured))
-        assert checkup.findings == ()
-        assert min(checkup.sightings.values()) > 5
 
 
 #: Name of the fault -> corners of a wrong map, kind of the finding, words about marker 9.

@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 from functools import partial
 
-import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -118,12 +117,6 @@ def reads_c3d(names, position_m):
         return partial(read_measured_corners, folder / "room.c3d")
 
     return prepare
-
-
-def opens_images_of_two_sizes(folder, run):
-    for number, shape in enumerate([(20, 30), (20, 32)]):
-        cv2.imwrite(str(folder / f"a{number}.png"), np.zeros(shape, np.uint8))
-    return lambda: list(open_source(folder, fps=25.0).frames())
 
 
 def third(corners):
@@ -244,7 +237,6 @@ BAD = {
     "large images": (reads_lens((1280, 960), name="left"), "lens.toml", "for 1280 x 960", "--scale-camera"),
     "axis off": (reads_lens_without_size, "for 1920 x 1080", "an optical axis at (320, 240)"),
     "several lenses": (reads_lens((640, 480)), "one camera, found left, right; name it by --camera-name"),
-    "two sizes": (opens_images_of_two_sizes, "a1.png: expected 30 x 20 pixels as in a0.png, found 32 x 20"),
     "no stream": (calls(open_source, "file:///nowhere.avi"), "a stream, found none that can be opened"),
     "no dictionary": (calls(MarkerDetector, "9x9"), "dictionary: expected one of ", "4x4_1000", "found 9x9"),
     "not in it": (calls(MarkerDetector, "4x4_50", ids=[50]), "markers of the map, found 4x4_50, 0 to 49"),
