@@ -15,7 +15,7 @@ ROUNDING = 1e-12
 
 def on_x_axis(*tracks, frame=None, **others) -> Trajectories:
     """Trajectories of drones on the x axis; a track is a list of x in metres, or None where x is unknown."""
-    x_m = np.array([[np.nan if x is None else x for x in track] for track in tracks], float).T
+    x_m = np.array(tracks, float).T
     frame = np.arange(len(x_m)) if frame is None else np.array(frame)
     position_m = np.stack([x_m, 0 * x_m, 0 * x_m], axis=-1)
     names = tuple(f"d{number}" for number in range(len(tracks)))
@@ -47,10 +47,9 @@ def random_flights(
     ref = flights(num_drones, "true")
     # At least one position of the reference must be known.
     ref.position_m[0, 0] = 0.0
-    orientation_wxyz = Rotation.random(num_frames * num_drones, rng=rng).as_quat(scalar_first=True)
-    return flights(num_estimates, "est"), replace(
-        ref, orientation_wxyz=orientation_wxyz.reshape(num_frames, num_drones, 4)
-    )
+    turns = Rotation.random(num_frames * num_drones, rng=rng)
+    turns_wxyz = turns.as_quat(scalar_first=True).reshape(num_frames, num_drones, 4)
+    return flights(num_estimates, "est"), replace(ref, orientation_wxyz=turns_wxyz)
 
 
 #: Frames of `circling_flights`.

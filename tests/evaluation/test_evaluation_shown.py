@@ -27,24 +27,25 @@ LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 def autoregressive(rng, count: int, persistence: float):
     """(count,), stationary autoregressive series of variance 1."""
     values = rng.normal(size=count)
+    new = np.sqrt(1 - persistence**2)
     for i in range(1, count):
-        values[i] = persistence * values[i - 1] + np.sqrt(1 - persistence**2) * values[i]
+        values[i] = persistence * values[i - 1] + new * values[i]
     return values
 
 
 def turning_flight(num_frames: int = 400):
     """Estimate and reference of a drone that flies and turns; the tracked point is at the end of the lever arm."""
     rng = np.random.default_rng(0)
-    time_s = np.arange(num_frames) / 25
-    ref_m = np.stack([np.cos(time_s), np.sin(0.7 * time_s), 1 + 0.2 * np.sin(2 * time_s)], axis=-1)[:, None]
-    turn = Rotation.from_euler("ZYX", np.stack([2 * time_s, 0.1 * np.sin(time_s), 0 * time_s], axis=-1))
-    est_m = ref_m + turn.apply(ARM_M)[:, None] + rng.normal(0, 0.02, ref_m.shape)
     frame = np.arange(num_frames)
-    turns_wxyz = turn.as_quat(scalar_first=True)[:, None]
-    return (
-        Trajectories(frame, time_s, ("0",), est_m),
-        Trajectories(frame, time_s, ("dron1",), ref_m, orientation_wxyz=turns_wxyz),
-    )
+    time_s = frame / 25
+    ref_m = np.stack([np.cos(time_s), np.sin(0.7 * time_s), 1 + 0.2 * np.sin(2 * time_s)], axis=-1)
+    angles = np.stack([2 * time_s, 0.1 * np.sin(time_s), 0 * time_s], axis=-1)
+    turn = Rotation.from_euler("ZYX", angles)
+    est_m = ref_m + turn.apply(ARM_M) + rng.normal(0, 0.02, ref_m.shape)
+    ref = Trajectories(frame, time_s, ("dron1",), ref_m[:, None])
+    est = Trajectories(frame, time_s, ("0",), est_m[:, None])
+    turns_wxyz = turn.as_quat(scalar_first=True)
+    return est, replace(ref, orientation_wxyz=turns_wxyz[:, None])
 
 
 class TestOffsets:
@@ -83,9 +84,6 @@ class TestOffsets:
         assert world.offset_m[2] == pytest.approx(ARM_M[2], abs=5e-3)
         largest_mm = 1e3 * max(body.offset_standard_error_m)
         assert f"drone's offset (body frame, known to {largest_mm:.1f} mm)" in tables.as_text(evaluation)
-        keys = list(evaluation.to_dict()["per_drone"][0])
-        place = keys.index("offset_m")
-        assert keys[place + 1 : place + 3] == ["offset_standard_error_m", "offset_frame"]
 
     def test_one_frame_has_no_standard_error(self):
         evaluation = evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0]))
@@ -140,13 +138,6 @@ class TestTable:
         scores = lines[next(n for n, line in enumerate(lines) if line.startswith("all")) + 1 :]
         first_words = [line[:10].strip() for line in scores]
         assert first_words == ["CLEAR", "", "HOTA", "GOSPA", "RMSE", "ellipsoid", "centred"]
-        # Long names are folded and not cut.
-        names = tuple(f"interceptor_of_the_left_hand_side_{number}" for number in range(3))
-        lines = tables.as_text(evaluate(*flights(names=names))).splitlines()
-        assert max(map(len, lines)) <= 80
-        width = lines[1].index("mean") - 2
-        shown = "".join(line[:width].replace(" ", "") for line in lines)
-        assert all(name in shown for name in names)
 
     def test_large_errors_are_shown_in_metres(self):
         est, ref = flights()
@@ -187,7 +178,8 @@ class TestPictures:
         for axes, two in ((above, [0, 1]), (side, [0, 2])):
             np.testing.assert_array_equal(axes.lines[0].get_xydata(), ref.position_m[:, 0, two])
             np.testing.assert_array_equal(axes.lines[3].get_xydata(), est.position_m[:, 0, two])
-            assert [line.get_color() for line in axes.lines[3:6]] == [*map(drone_colour, range(3))]
+            for drone in range(3):
+                assert axes.lines[3 + drone].get_color() == drone_colour(drone)
             assert axes.get_aspect() == 1
         assert above.get_xlim() == side.get_xlim()
         expected_mm = np.full(NUM_FRAMES, 20.0)
@@ -197,8 +189,9 @@ class TestPictures:
         assert errors.get_yscale() == "linear"
 
     def test_a_swap_is_marked_and_makes_the_scale_logarithmic(self, drawn):
-        errors = drawn(*flights(swap=True))[2]
-        assert [list(mark.get_xdata()) for mark in errors.lines[3:]] == [[40 / 25] * 2]
+        _, _, errors = drawn(*flights(swap=True))
+        (mark,) = errors.lines[3:]
+        assert list(mark.get_xdata()) == [40 / 25, 40 / 25]
         assert errors.get_yscale() == "log"
 
     def test_lines_have_gaps_at_frames_without_reference_and_a_false_track_is_named(self, drawn):
@@ -207,17 +200,18 @@ class TestPictures:
         all_axes = drawn(est, ref.of_drones([0, 1]))
         for axes in all_axes:
             # A line has 45 frames with a reference, and one NaN for the gap.
-            assert len(axes.lines[0].get_ydata()) == 46
-            assert np.flatnonzero(np.isnan(axes.lines[0].get_ydata())).tolist() == [25]
+            line = axes.lines[0].get_ydata()
+            assert len(line) == 46
+            assert np.flatnonzero(np.isnan(line)).tolist() == [25]
         assert all_axes[0].get_legend().get_texts()[-1].get_text() == "false track 2"
 
 
 def test_the_clock_of_the_reference_is_searched_or_given(run_psotrack, tmp_path_factory):
     root = make_once(tmp_path_factory, "late_videos", make_late_videos)
-    words = ("evaluate", root / "tracks.csv", root / "Real_Data" / "R12_D2", "--json", "-", "--offset")
-    late, auto, given = (
-        json.loads(run_psotrack(*each).out) for each in (words[:-1], (*words, "auto"), (*words, LATE_S))
-    )
+    words = ("evaluate", root / "tracks.csv", root / "Real_Data" / "R12_D2", "--json", "-")
+    late = json.loads(run_psotrack(*words).out)
+    auto = json.loads(run_psotrack(*words, "--offset", "auto").out)
+    given = json.loads(run_psotrack(*words, "--offset", LATE_S).out)
     assert "reference_offset_s" not in late
     assert given["reference_offset_s"] == LATE_S
     assert auto["reference_offset_s"] == pytest.approx(LATE_S, abs=0.1 / FPS)
@@ -226,7 +220,7 @@ def test_the_clock_of_the_reference_is_searched_or_given(run_psotrack, tmp_path_
     for errors in (auto, given):
         assert (errors["id_switches"], errors["missed_rate"]) == (0, 0.0)
         assert errors["offset_removed_mean_error_m"] < 0.02
-    refused = run_psotrack(*words, "soon")
+    refused = run_psotrack(*words, "--offset", "soon")
     assert "expected a number of seconds, or auto, found 'soon'" in refused.err
 
 

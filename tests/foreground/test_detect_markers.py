@@ -14,61 +14,59 @@ from marker_pictures import Sheet, picture, rows_of_sheets
 from real_data import published
 
 from psotrack.foreground.markers import MarkerDetector, marker_dictionary
-from psotrack.recordings import VideoWriter, probe, read_frames, read_grey
+from psotrack.recordings import VideoWriter, read_grey
 
 COLUMNS = ["id", "x0_px", "y0_px", "x1_px", "y1_px", "x2_px", "y2_px", "x3_px", "y3_px", "std_px"]
 
 
-def opencv_markers(gray, dictionary, refinement=cv2.aruco.CORNER_REFINE_NONE):
+def opencv_markers(gray, dictionary, refinement):
     """Ids and corners by OpenCV's detector with its defaults."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
-    quads, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(gray)
-    return [] if ids is None else list(zip(ids.ravel().tolist(), [quad[0] for quad in quads], strict=True))
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
+    quads, ids, _ = detector.detectMarkers(gray)
+    if ids is None:
+        return []
+    return [(int(marker), quad[0]) for (marker,), quad in zip(ids, quads, strict=True)]
 
 
-def missing(markers, found):
-    """Ids and corners that are not among the found markers."""
-    return [
-        (marker, quad)
-        for marker, quad in markers
-        if not np.any(
-            (found.ids == marker)
-            & (
-                np.linalg.norm(found.corners_px.mean(axis=1) - quad.mean(axis=0), axis=-1)
-                < 0.2 * np.linalg.norm(quad[0] - quad[2])
-            )
-        )
-    ]
+def is_among(found, marker, quad):
+    """Whether a marker was found at this place."""
+    diagonal_px = np.linalg.norm(quad[0] - quad[2])
+    off_px = np.linalg.norm(found.corners_px.mean(axis=1) - quad.mean(axis=0), axis=-1)
+    is_it = (found.ids == marker) & (off_px < 0.2 * diagonal_px)
+    return is_it.any()
 
 
 def overlooked(gray, dictionary, found):
     """Markers of OpenCV's that are not among the found ones."""
-    ways = (cv2.aruco.CORNER_REFINE_NONE, cv2.aruco.CORNER_REFINE_SUBPIX)
-    return missing([each for way in ways for each in opencv_markers(gray, dictionary, way)], found)
+    missing = []
+    for refinement in (cv2.aruco.CORNER_REFINE_NONE, cv2.aruco.CORNER_REFINE_SUBPIX):
+        for marker, quad in opencv_markers(gray, dictionary, refinement):
+            if not is_among(found, marker, quad):
+                missing.append(marker)
+    return missing
 
 
 def wrong_ones(found, sheets):
     """Ids of found markers that are not at the places of the sheets."""
-    return [
-        marker
-        for marker, quad in zip(found.ids.tolist(), found.corners_px, strict=True)
-        if not any(
-            sheet.marker == marker
-            and np.linalg.norm(sheet.corners_px - quad, axis=-1).max() < 0.2 * sheet.side_px + 2
-            for sheet in sheets
-        )
-    ]
+    wrong = []
+    for marker, quad in zip(found.ids.tolist(), found.corners_px, strict=True):
+        there = [sheet for sheet in sheets if sheet.marker == marker]
+        off_px = [np.linalg.norm(sheet.corners_px - quad, axis=-1).max() for sheet in there]
+        if not any(off < 0.2 * sheet.side_px + 2 for sheet, off in zip(there, off_px, strict=True)):
+            wrong.append(marker)
+    return wrong
 
 
 def errors_and_std(gray, sheets):
     """Errors of the corners of found sheets, (sheets, 4, 2), and their standard deviations, pixels."""
     found = MarkerDetector("4x4_50").detect(gray)
-    at = {marker: index for index, marker in enumerate(found.ids.tolist())}
-    seen = [sheet for sheet in sheets if sheet.marker in at]
-    index = [at[sheet.marker] for sheet in seen]
-    errors_px = found.corners_px[index] - np.array([sheet.corners_px for sheet in seen])
-    return errors_px, found.std_px[index]
+    true_px = {sheet.marker: sheet.corners_px for sheet in sheets}
+    errors_px = [
+        quad - true_px[marker] for marker, quad in zip(found.ids.tolist(), found.corners_px, strict=True)
+    ]
+    return np.array(errors_px), found.std_px
 
 
 @settings(max_examples=10)
@@ -95,9 +93,8 @@ def test_markers_of_15_pixels_and_more_are_found(inverted):
     """OpenCV finds no marker with sides below 0.75 % of the longer side, which are 9.6 pixels here, and no inverted."""
     size_wh = (1280, 720)
     sheets = rows_of_sheets(np.random.default_rng(3), 50, size_wh, (15, 40), tilt=0.3)
-    found = MarkerDetector("4x4_50", thorough=True).detect(
-        picture(sheets, size_wh, inverted=inverted, blur_px=0.6)
-    )
+    gray = picture(sheets, size_wh, inverted=inverted, blur_px=0.6)
+    found = MarkerDetector("4x4_50", thorough=True).detect(gray)
     assert wrong_ones(found, sheets) == []
     # Measured 50 and 50.
     assert len(found) >= len(sheets) - 1
@@ -105,12 +102,10 @@ def test_markers_of_15_pixels_and_more_are_found(inverted):
 
 def test_a_photograph_of_24_megapixels():
     """A marker that fills most of the picture, blurred over tens of pixels, beside some of 15 to 60 pixels."""
-    scale, size_wh = 12, (6000, 4000)
-    coarse = Sheet(
-        7, (0.65 * size_wh[0] / scale, 0.5 * size_wh[1] / scale), 2500 / scale, turn=0.15, tilt=0.2
-    )
-    small = picture([coarse], (size_wh[0] // scale, size_wh[1] // scale), noise=0.0)
-    gray = cv2.resize(small, size_wh, interpolation=cv2.INTER_CUBIC)
+    scale = 12
+    coarse = Sheet(7, (325.0, 500 / 3), 2500 / scale, turn=0.15, tilt=0.2)
+    small = picture([coarse], (500, 333), noise=0.0)
+    gray = cv2.resize(small, (6000, 4000), interpolation=cv2.INTER_CUBIC)
     others = rows_of_sheets(np.random.default_rng(1), 9, (640, 480), (15, 60), tilt=0.3)
     others = [sheet for sheet in others if sheet.marker != 7]
     gray[100:580, 100:740] = picture(others, (640, 480))
@@ -118,33 +113,35 @@ def test_a_photograph_of_24_megapixels():
     assert overlooked(gray, "4x4_50", found) == []
     assert set(found.ids.tolist()) == {7, *(sheet.marker for sheet in others)}
     large = found.corners_px[found.ids.tolist().index(7)]
-    true = (coarse.corners_px + 0.5) * np.array(size_wh) / small.shape[::-1] - 0.5
+    true = (coarse.corners_px + 0.5) * [6000 / 500, 4000 / 333] - 0.5
     # Found: a blurred edge between two samples counted as sharp, and the corner was off by 12 pixels.
-    assert np.linalg.norm(large - true, axis=-1).max() < 0.3 * scale
+    off_px = np.linalg.norm(large - true, axis=-1)
+    assert off_px.max() < 0.3 * scale
 
 
 @pytest.mark.parametrize(
     ("changes", "sheets", "limit_px"),
     [
-        # Limits of the root mean square error along an axis; measured 0.03, 0.05, 0.08, 0.12.
+        # Limits of the root mean square error along an axis; measured 0.03, 0.08, 0.12.
         ({}, {}, 0.06),
-        ({"blur_px": 1.5}, {}, 0.1),
         ({"noise": 8.0}, {}, 0.16),
         # Straight lines through these edges miss the corners by 0.6 and more.
         ({}, {"bow": 0.08, "tilt": 0.8}, 0.35),
     ],
-    ids=["sharp", "soft", "noisy", "bent"],
+    ids=["sharp", "noisy", "bent"],
 )
 def test_standard_deviations_of_corners_are_honest(changes, sheets, limit_px):
     """The squared errors in units of their variances have a mean near 1; far below it, the deviations say too much."""
-    measured = []
+    size_wh = (900, 700)
+    mean_squares, std_px = [], []
     for seed in range(2):
-        size_wh = (900, 700)
         shown = rows_of_sheets(np.random.default_rng(seed), 12, size_wh, (40, 95), **sheets)
-        measured.append(errors_and_std(picture(shown, size_wh, seed=seed, **changes), shown))
-    errors_px, std_px = (np.concatenate(parts) for parts in zip(*measured, strict=True))
-    mean_squares = (errors_px**2).mean(axis=(1, 2))
-    squares = mean_squares / std_px**2
+        gray = picture(shown, size_wh, seed=seed, **changes)
+        errors_px, own_std_px = errors_and_std(gray, shown)
+        mean_squares.extend((errors_px**2).mean(axis=(1, 2)))
+        std_px.extend(own_std_px)
+    mean_squares = np.array(mean_squares)
+    squares = mean_squares / np.square(std_px)
     assert len(squares) >= 18
     assert np.sqrt(mean_squares.mean()) < limit_px
     assert 0.05 < squares.mean() < 2.0
@@ -154,55 +151,52 @@ def test_standard_deviations_of_corners_are_honest(changes, sheets, limit_px):
 
 def test_blur_by_motion_moves_no_corner_far():
     """Found: edges into which blur had mixed other cells counted as bent, which moved corners by up to 2.9 pixels."""
-    errors = []
+    off_px = []
     for seed in range(2):
         shown = rows_of_sheets(np.random.default_rng(11020 + seed), 24, (800, 600), (28, 50), tilt=0.6)
-        light = cv2.blur((picture(shown, (800, 600), noise=0.0, seed=seed) / 255) ** 2.2, (7, 1))
+        sharp = picture(shown, (800, 600), noise=0.0, seed=seed)
+        light = cv2.blur((sharp / 255) ** 2.2, (7, 1))
         noise = np.random.default_rng(seed).normal(0, 2, light.shape)
-        gray = np.clip(np.round(255 * light ** (1 / 2.2) + noise), 0, 255).astype(np.uint8)
-        errors.append(errors_and_std(gray, shown)[0])
+        levels = np.round(255 * light ** (1 / 2.2) + noise)
+        gray = np.clip(levels, 0, 255).astype(np.uint8)
+        errors_px, _ = errors_and_std(gray, shown)
+        off_px.extend(np.linalg.norm(errors_px, axis=-1))
     # Measured 1.2 in the worst of 36 markers.
-    assert len(np.concatenate(errors)) >= 34
-    assert np.linalg.norm(np.concatenate(errors), axis=-1).max() < 1.5
+    assert len(off_px) >= 34
+    assert np.max(off_px) < 1.5
 
 
-def flat_sheets_of_8_cells():
+def assert_none_of(dictionaries, gray):
+    for dictionary in dictionaries:
+        found = MarkerDetector(dictionary, thorough=True).detect(gray)
+        assert len(found) == 0, dictionary
+
+
+def test_noise_and_markers_of_another_dictionary_are_no_markers():
+    for seed in range(3):
+        assert_none_of(["4x4_1000", "aruco_original"], picture([], (640, 480), noise=6.0, seed=seed))
+    sheets = rows_of_sheets(np.random.default_rng(5), 12, (900, 700), (40, 95))
+    gray = picture(sheets, (900, 700), "6x6_250")
+    assert_none_of(["4x4_50", "5x5_100", "apriltag_36h11"], gray)
+
+
+def test_the_middle_of_a_marker_of_more_cells_is_no_marker():
     """The middles of 6 x 6 cells on marker 3 of 8 x 8 cells look like a marker of 4x4_50, seen straight from ahead."""
-    names = [0, 1, 2, 3, 5, 6, 15, 17, 19, 33]
-    places = [(70.0 + 110 * (k % 5), 70.0 + 110 * (k // 5)) for k in range(len(names))]
-    sheets = [Sheet(name, place, 74.0) for name, place in zip(names, places, strict=True)]
-    return picture(sheets, (600, 300), "6x6_250", blur_px=0.5, seed=2)
+    sheets = []
+    for number, name in enumerate([0, 1, 2, 3, 5, 6, 15, 17, 19, 33]):
+        row, column = divmod(number, 5)
+        sheets.append(Sheet(name, (70.0 + 110 * column, 70.0 + 110 * row), 74.0))
+    gray = picture(sheets, (600, 300), "6x6_250", blur_px=0.5, seed=2)
+    assert_none_of(["4x4_50", "4x4_1000", "aruco_original"], gray)
 
 
-def halves():
+def test_half_a_marker_is_no_marker():
     """What the four borders of an image leave of a marker. Found: the right half of 52 was read as 660."""
     half = picture([Sheet(52, (0.5, 80.0), 80.0)], (200, 160), "4x4_1000")
-    return [half, half[:, ::-1].copy(), half.T.copy(), half.T[::-1].copy()]
-
-
-#: What is shown -> pictures, and dictionaries whose markers are not there.
-WITHOUT = {
-    "no markers": (
-        lambda: [picture([], (640, 480), noise=6.0, seed=seed) for seed in range(3)],
-        ["4x4_1000", "aruco_original"],
-    ),
-    "another dictionary": (
-        lambda: [
-            picture(rows_of_sheets(np.random.default_rng(5), 12, (900, 700), (40, 95)), (900, 700), "6x6_250")
-        ],
-        ["4x4_50", "5x5_100", "apriltag_36h11"],
-    ),
-    "more cells": (lambda: [flat_sheets_of_8_cells()], ["4x4_50", "4x4_1000", "aruco_original"]),
-    "halves": (halves, ["4x4_1000"]),
-}
-
-
-@pytest.mark.parametrize("case", WITHOUT)
-def test_what_is_not_there_is_not_read(case):
-    pictures, dictionaries = WITHOUT[case]
-    for gray in pictures():
-        for dictionary in dictionaries:
-            assert len(MarkerDetector(dictionary, thorough=True).detect(gray)) == 0, dictionary
+    for turns in range(4):
+        gray = np.rot90(half, turns)
+        assert_none_of(["4x4_1000"], np.ascontiguousarray(gray))
+        assert_none_of(["4x4_1000"], np.ascontiguousarray(gray[:, ::-1]))
 
 
 # --- the command
@@ -220,25 +214,39 @@ def detect(run_psotrack):
 
 def test_the_table_of_photographs(detect, tmp_path):
     """In grey and in colour, of a sensor of 12 bits, and in the negative."""
-    sheets = [Sheet(7, (150.2, 120.4), 90.0, 0.3), Sheet(21, (330.1, 200.7), 70.0, 1.2, 0.5)]
-    sheets.append(Sheet(7, (120.3, 270.2), 60.0, 0.8))
-    gray, folder, out = picture(sheets), tmp_path / "photographs", tmp_path / "markers.csv"
-    images = {"grey.png": gray, "colour.jpg": cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)}
-    images |= {"deep.png": gray.astype(np.uint16) * 16, "inverted.png": 255 - gray}
+    sheets = [
+        Sheet(7, (150.2, 120.4), 90.0, 0.3),
+        Sheet(21, (330.1, 200.7), 70.0, 1.2, 0.5),
+        Sheet(7, (120.3, 270.2), 60.0, 0.8),
+    ]
+    gray = picture(sheets)
+    images = {
+        "grey.png": gray,
+        "colour.jpg": cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR),
+        "deep.png": gray.astype(np.uint16) * 16,
+        "inverted.png": 255 - gray,
+    }
+    folder, out = tmp_path / "photographs", tmp_path / "markers.csv"
     folder.mkdir()
     for name, image in images.items():
         cv2.imwrite(str(folder / name), image)
+    # Only the parts that an image needs decide: a text of three bytes without its checksum, after the header.
+    whole = (folder / "grey.png").read_bytes()
+    damaged_text = (3).to_bytes(4) + b"tEXta\0b" + bytes(4)
+    (folder / "grey.png").write_bytes(whole[:33] + damaged_text + whole[33:])
     said = detect(folder, "--dictionary", "4x4_50", "--out", out, "--json", tmp_path / "markers.json")
     assert f"{out}: 12 markers in 4 of 4 images" in said.out
     rows = table(out)
     assert list(rows[0]) == ["image", *COLUMNS]
-    ids = {name: sorted(int(row["id"]) for row in rows if row["image"] == name) for name in images}
-    assert list(ids.values()) == [[7, 7, 21]] * 4
+    for name in images:
+        ids = [row["id"] for row in rows if row["image"] == name]
+        assert sorted(ids) == ["21", "7", "7"]
     for row in rows:
         corners = np.array([float(row[name]) for name in COLUMNS[1:-1]]).reshape(4, 2)
-        off = min(np.linalg.norm(sheet.corners_px - corners, axis=-1).max() for sheet in sheets)
+        off_px = [np.linalg.norm(sheet.corners_px - corners, axis=-1).max() for sheet in sheets]
         # Measured 0.42 in the negative, whose blurred edges have the levels of no camera, and 0.1 in the others.
-        assert off < (0.6 if row["image"] == "inverted.png" else 0.2)
+        limit_px = 0.6 if row["image"] == "inverted.png" else 0.2
+        assert min(off_px) < limit_px
         assert 0.01 < float(row["std_px"]) < 0.5
     content = json.loads((tmp_path / "markers.json").read_text())
     assert (content["images"], content["markers"], content["by_id"]) == (4, 12, {"7": 8, "21": 4})
@@ -252,18 +260,19 @@ def test_the_table_of_photographs(detect, tmp_path):
 
 
 def test_the_table_of_a_video(detect, tmp_path):
-    sheets = [Sheet(7, (150.0 + 4 * frame, 120.0), 90.0, 0.3) for frame in range(5)]
+    sheet = Sheet(7, (150.0, 120.0), 90.0, 0.3)
     video, out = tmp_path / "video.avi", tmp_path / "markers.csv"
     with VideoWriter(video, 25.0, (480, 360)) as writer:
-        for number, sheet in enumerate(sheets):
-            gray = picture([sheet] if number != 2 else [])
+        for sheets in ([sheet], [sheet], [], [sheet]):
+            gray = picture(sheets)
             writer.write(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR))
-    assert "4 markers in 4 of 5 frames" in detect(video, "--out", out).out
+    assert "3 markers in 3 of 4 frames" in detect(video, "--out", out).out
     rows = table(out)
     assert list(rows[0]) == ["frame", *COLUMNS]
-    assert [(row["frame"], row["id"]) for row in rows] == [(f"{frame}", "7") for frame in (0, 1, 3, 4)]
+    assert [row["frame"] for row in rows] == ["0", "1", "3"]
     for row in rows:
-        assert abs(float(row["x0_px"]) - sheets[int(row["frame"])].corners_px[0, 0]) < 0.5
+        assert row["id"] == "7"
+        assert abs(float(row["x0_px"]) - sheet.corners_px[0, 0]) < 0.5
     detect(video, "--out", out, "--frames", "2", "--force")
     assert [row["frame"] for row in table(out)] == ["0", "1"]
 
@@ -271,7 +280,6 @@ def test_the_table_of_a_video(detect, tmp_path):
 #: Name of the case -> words of the command, and words of the line.
 BAD = {
     "no image": (["notes.png"], "notes.png: expected an image, found a file that is no PNG"),
-    "gone": (["gone.jpg"], "gone.jpg: expected an image, found no such file"),
     "empty folder": (["empty"], "empty: expected images, which end in .png"),
     "dictionary": (["image.png", "--dictionary", "9x9"], "dictionary: expected one of 4x4_100"),
     "image and video": (["image.png", "video.avi"], "found another file; a video needs a call of its own"),
@@ -293,19 +301,6 @@ def test_unusable_input_is_one_line(case, detect, tmp_path, monkeypatch):
     whole = (tmp_path / "image.png").read_bytes()
     (tmp_path / "damaged.png").write_bytes(whole[:5000] + bytes(40) + whole[5040:])
     assert_refused(functools.partial(detect, *command, "--out", "new.csv"), words, unchanged=tmp_path)
-
-
-def test_notes_in_a_png_may_be_damaged_and_levels_may_have_any_depth(tmp_path):
-    path = tmp_path / "noted.png"
-    gray = picture([Sheet(7, (150.0, 120.0), 90.0)])
-    # All but the brightest pixels fill the 8 bits, whatever the depth of the file.
-    for bits in (16, 12, 10):
-        cv2.imwrite(str(path), gray.astype(np.uint16) << (bits - 8))
-        np.testing.assert_allclose(read_grey(path).astype(int), gray, atol=1)
-    # Only the parts that an image needs decide: a text of three bytes without its checksum, after the header.
-    whole = path.read_bytes()
-    path.write_bytes(whole[:33] + (3).to_bytes(4) + b"tEXta\0b" + bytes(4) + whole[33:])
-    np.testing.assert_allclose(read_grey(path).astype(int), gray, atol=1)
 
 
 # --- photographs of other people
@@ -335,16 +330,8 @@ def test_what_opencv_finds_in_photographs_is_found(name, pattern, dictionary):
 
 @pytest.mark.real
 @pytest.mark.slow
-def test_inverted_boards_in_videos_and_unknown_markers():
-    """In the negative, OpenCV finds the markers of these boards, of 15 to 60 pixels."""
-    folder = published("mprib/caliscope") / "tests/sessions/charuco_calibration"
-    detector = MarkerDetector("4x4_50", thorough=True)
-    for path in sorted(folder.glob("**/*.mp4")):
-        for number, frame in enumerate(read_frames(probe(path))):
-            if number in (0, 32, 64):
-                gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                assert missing(opencv_markers(255 - gray, "4x4_50"), detector.detect(gray)) == []
-    unknown = published("QAlexBall/opencv_contrib") / "modules/aruco/tutorials"
-    for path in sorted(unknown.glob("**/*original.png")):
-        for dictionary in ("4x4_50", "5x5_1000", "6x6_250", "7x7_1000", "apriltag_36h11"):
-            assert len(MarkerDetector(dictionary, thorough=True).detect(read_grey(path))) == 0, path.name
+def test_no_marker_is_found_in_photographs_of_unknown_markers():
+    folder = published("QAlexBall/opencv_contrib") / "modules/aruco/tutorials"
+    for path in sorted(folder.glob("**/*original.png")):
+        gray = read_grey(path)
+        assert_none_of(["4x4_50", "5x5_1000", "6x6_250", "7x7_1000", "apriltag_36h11"], gray)

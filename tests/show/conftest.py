@@ -1,19 +1,17 @@
 """The small flight that the tests of this folder show."""
 
-from pathlib import Path
-
 import pytest
 from worlds import two_flights
 
-from psotrack.show.flights import TrackedFlight, read_flight
+from psotrack.show.flights import read_flight
 
 
 @pytest.fixture(scope="session")
-def world(tmp_path_factory) -> Path:
+def world(tmp_path_factory):
     """A folder with the sequence `flight` and the tracks `tracks.csv`, which no test changes."""
     return two_flights(tmp_path_factory)
 
 
 @pytest.fixture
-def flight(world) -> TrackedFlight:
+def flight(world):
     return read_flight([world / "tracks.csv"], world / "flight")

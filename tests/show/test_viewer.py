@@ -16,16 +16,7 @@ import pytest
 import rerun as rr
 from helpers import Output, assert_refused, drawn_silhouettes, listening_at
 from rerun.chunk import RrdReader
-from worlds import (
-    CAMERAS,
-    COASTING,
-    IMAGE_SIZE_WH,
-    LOST_FROM,
-    NUM_FRAMES,
-    REFERENCE,
-    make_tracks,
-    make_tracks_file,
-)
+from worlds import CAMERAS, COASTING, IMAGE_SIZE_WH, LOST_FROM, NUM_FRAMES, REFERENCE, make_tracks
 
 from psotrack.geometry import project
 from psotrack.geometry.rig_files import read_rig
@@ -33,9 +24,6 @@ from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames, v
 from psotrack.show.flights import read_flight
 from psotrack.show.viewer import LiveView, ViewContent, write_flight
 from psotrack.trajectories import write_trajectories
-
-#: Frames in which a drone is shown that is lost at the end.
-UNTIL_LOST = range(LOST_FROM)
 
 
 @pytest.fixture
@@ -65,7 +53,8 @@ def read_entities(path):
 def silhouettes(world):
     """The silhouettes of the drones, by rays through each pixel."""
     size_m = np.tile([0.3, 0.3, 0.15], (2, 1))
-    return drawn_silhouettes(read_rig(world / "flight" / "rig.toml"), make_tracks().position_m, size_m, 2)
+    rig = read_rig(world / "flight" / "rig.toml")
+    return drawn_silhouettes(rig, make_tracks().position_m, size_m, 2)
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +69,13 @@ def saved(world, silhouettes, tmp_path_factory):
 def test_positions_are_those_of_the_tracks(saved):
     tracks = make_tracks(0.01)
     for drone in range(2):
-        frames, centres = saved[f"/world/drones/{drone}/body"]["Boxes3D:centers"]
+        body = saved[f"/world/drones/{drone}/body"]
+        frames, centres = body["Boxes3D:centers"]
         assert frames == list(range(NUM_FRAMES))
         # Rerun keeps float32.
         np.testing.assert_allclose(np.array(centres)[:, 0], tracks.position_m[:, drone], atol=1e-6)
-        _, halves = saved[f"/world/drones/{drone}/body"]["Boxes3D:half_sizes"]
-        np.testing.assert_allclose(np.array(halves)[:, 0], [[0.15, 0.15, 0.075]] * NUM_FRAMES, atol=1e-6)
+        _, halves = body["Boxes3D:half_sizes"]
+        np.testing.assert_allclose(halves, [[[0.15, 0.15, 0.075]]] * NUM_FRAMES, atol=1e-6)
         _, axes = saved[f"/world/drones/{drone}/ellipsoid"]["Ellipsoids3D:half_sizes"]
         # 6.2514 is the 90 % quantile of chi-squared with three degrees of freedom; deviations are 2, 4 and 6 cm.
         expected = np.sqrt(6.2514) * np.array([0.02, 0.04, 0.06])
@@ -101,10 +91,12 @@ def test_status_is_shown_by_words_and_colours(saved):
     body = saved["/world/drones/1/body"]
     labels = [row[0] for row in body["Boxes3D:labels"][1]]
     assert labels[COASTING] == ["1 coasting"] * 2
-    assert set(labels[: COASTING.start] + labels[COASTING.stop :]) == {"1"}
+    assert labels[: COASTING.start] == ["1"] * COASTING.start
+    assert set(labels[COASTING.stop :]) == {"1"}
     colours = np.array(body["Boxes3D:colors"][1])[:, 0]
-    assert len(set(colours[COASTING])) == 1
-    assert set(colours[COASTING]).isdisjoint(colours[: COASTING.start])
+    before, during = set(colours[: COASTING.start]), set(colours[COASTING])
+    assert len(during) == 1
+    assert during.isdisjoint(before)
     frames, words = saved["/status/1"]["StateChange:state"]
     assert frames == [0, COASTING.start, COASTING.stop]
     assert words == [["tracked"], ["coasting"], ["tracked"]]
@@ -127,63 +119,64 @@ def decoded(blob):
 
 def test_images_and_silhouettes_are_those_of_the_cameras(saved, flight, silhouettes):
     for name, coverage in zip(CAMERAS, silhouettes.arrays, strict=True):
-        images, masks, blobs = (
-            saved[f"/world/cameras/{name}/{part}"] for part in ("image", "silhouettes", "blobs")
-        )
-        assert images["EncodedImage:blob"][0] == list(range(NUM_FRAMES))
+        camera = f"/world/cameras/{name}"
+        frames, images = saved[f"{camera}/image"]["EncodedImage:blob"]
+        _, masks = saved[f"{camera}/silhouettes"]["EncodedImage:blob"]
+        _, centres = saved[f"{camera}/blobs"]["Boxes2D:centers"]
+        _, halves = saved[f"{camera}/blobs"]["Boxes2D:half_sizes"]
+        assert frames == list(range(NUM_FRAMES))
         filmed = read_frames(flight.recording.videos[name])
         for frame, before in enumerate(filmed):
             # Noise of 30 levels loses some of them in JPEG; another frame differs by 12 on average.
-            image, mask = (decoded(each["EncodedImage:blob"][1][frame]) for each in (images, masks))
+            image = decoded(images[frame])
             assert np.abs(image.astype(float) - before).mean() < 6
             # As opaque as a cell is covered, up to 55 %, and without colour where nothing is.
-            np.testing.assert_allclose(mask[..., 3], 0.55 * coverage[frame], atol=1)
-            assert (mask[coverage[frame] == 0] == 0).all()
-            assert (mask[coverage[frame] > 0][:, :3] == [0, 255, 170]).all()
+            mask = decoded(masks[frame])
+            covered = coverage[frame]
+            np.testing.assert_allclose(mask[..., 3], 0.55 * covered, atol=1)
+            assert (mask[covered == 0] == 0).all()
+            assert (mask[covered > 0][:, :3] == [0, 255, 170]).all()
             # Boxes of blobs hold the covered cells, of two pixels.
-            rows, columns = np.nonzero(coverage[frame] > 128)
-            centres, halves = (
-                np.array(blobs[f"Boxes2D:{part}"][1][frame]) for part in ("centers", "half_sizes")
-            )
-            off_px = np.abs(2 * np.stack([columns, rows], axis=1)[:, None] + 1 - centres) - halves
-            assert (off_px.max(axis=2).min(axis=1) < 2).all()
+            cells = np.argwhere(covered > 128)[:, None, ::-1]
+            off_px = np.abs(2 * cells + 1 - centres[frame]) - halves[frame]
+            nearest_px = off_px.max(axis=2).min(axis=1)
+            assert (nearest_px < 2).all()
 
 
-def test_boxes_and_ellipses_are_about_the_drones_and_cameras_stand_where_the_rig_says(saved, flight):
+def test_boxes_and_ellipses_are_about_the_drones(saved, flight):
     rig, tracks = flight.recording.rig, flight.tracks[0]
     expected = view_in_images(flight.recording, tracks.trajectories, tracks.size_m).boxes_px
     for index, name in enumerate(CAMERAS):
-        boxes, camera = saved[f"/world/cameras/{name}/boxes"], saved[f"/world/cameras/{name}"]
-        outlines = saved[f"/world/cameras/{name}/ellipses"]["LineStrips2D:strips"][1]
+        boxes = saved[f"/world/cameras/{name}/boxes"]
+        _, labels = boxes["Boxes2D:labels"]
+        _, centres = boxes["Boxes2D:centers"]
+        _, halves = boxes["Boxes2D:half_sizes"]
+        _, outlines = saved[f"/world/cameras/{name}/ellipses"]["LineStrips2D:strips"]
         pixels, _ = project(rig.cameras[index], tracks.trajectories.position_m)
         for frame in range(NUM_FRAMES):
-            seen = [0, 1] if frame in UNTIL_LOST else [1]
-            assert boxes["Boxes2D:labels"][1][frame] == [str(drone) for drone in seen]
-            centres, halves = (boxes[f"Boxes2D:{part}"][1][frame] for part in ("centers", "half_sizes"))
-            xyxy = np.hstack([np.subtract(centres, halves), np.add(centres, halves)])
-            np.testing.assert_allclose(xyxy, expected[frame, seen, index], atol=1e-3)
+            seen = [0, 1] if frame < LOST_FROM else [1]
+            assert labels[frame] == [str(drone) for drone in seen]
+            low = np.subtract(centres[frame], halves[frame])
+            high = np.add(centres[frame], halves[frame])
+            np.testing.assert_allclose(np.hstack([low, high]), expected[frame, seen, index], atol=1e-3)
             # The outline is symmetric about the drone's pixel, which has its centre half a pixel further in Rerun.
-            middles = np.mean(outlines[frame], axis=1, where=np.arange(25)[:, None] < 24)
-            np.testing.assert_allclose(middles, pixels[frame, seen] + 0.5, atol=1e-2)
+            for outline, pixel in zip(outlines[frame], pixels[frame, seen], strict=True):
+                middle = np.mean(outline[:24], axis=0)
+                np.testing.assert_allclose(middle, pixel + 0.5, atol=1e-2)
+
+
+def test_cameras_stand_where_the_rig_says(saved, flight):
+    cameras = flight.recording.rig.cameras
+    for index, name in enumerate(CAMERAS):
+        camera = saved[f"/world/cameras/{name}"]
         times, places = camera["Transform3D:translation"]
         assert times == [None]
-        np.testing.assert_allclose(places[0][0], rig.cameras[index].centre_world, atol=1e-5)
-        K = np.reshape(camera["Pinhole:image_from_camera"][1][0][0], (3, 3)).T
-        np.testing.assert_allclose(K[:2, 2], rig.cameras[index].K[:2, 2] + 0.5, atol=1e-4)
-        np.testing.assert_array_equal(camera["Pinhole:resolution"][1][0][0], IMAGE_SIZE_WH)
-
-
-def test_two_files_of_tracks_are_two_colours(run, world, tmp_path):
-    other, out = make_tracks_file(tmp_path / "other.csv", 0.05), tmp_path / "both.rrd"
-    assert run(world / "tracks.csv", other, "--save", out, "--quiet").code == 0
-    entities = read_entities(out)
-    colours = [
-        [entities[f"/world/drones/{name}/{drone}/body"]["Boxes3D:colors"][1][0][0] for drone in range(2)]
-        for name in ("tracks", "other")
-    ]
-    assert [len(set(each)) for each in colours] == [1, 1]
-    assert colours[0] != colours[1]
-    assert not any(path.startswith("/world/cameras") for path in entities), "no recording is given"
+        np.testing.assert_allclose(places[0][0], cameras.centre_world[index], atol=1e-5)
+        _, projections = camera["Pinhole:image_from_camera"]
+        K = np.reshape(projections[0][0], (3, 3)).T
+        np.testing.assert_allclose(K[:2, 2], cameras.K[index, :2, 2] + 0.5, atol=1e-4)
+        _, sizes = camera["Pinhole:resolution"]
+        np.testing.assert_array_equal(sizes[0][0], IMAGE_SIZE_WH)
 
 
 def test_the_first_frames_of_some_cameras_and_what_the_file_has_is_said(run, world, tmp_path):
@@ -194,20 +187,16 @@ def test_the_first_frames_of_some_cameras_and_what_the_file_has_is_said(run, wor
     assert "--silhouettes computes them" in out
     assert not (tmp_path / "cache").exists()
     entities = read_entities(tmp_path / "part.rrd")
-    for path, component in (
-        ("cameras/c0/image", "EncodedImage:blob"),
-        ("drones/1/body", "Boxes3D:centers"),
-        ("truth/dron1/point", "Points3D:positions"),
-    ):
-        assert entities[f"/world/{path}"][component][0] == list(range(5))
+    images, _ = entities["/world/cameras/c0/image"]["EncodedImage:blob"]
+    bodies, _ = entities["/world/drones/1/body"]["Boxes3D:centers"]
+    assert images == bodies == [0, 1, 2, 3, 4]
     assert "/world/cameras/c1" not in entities
 
 
-@pytest.mark.parametrize("share", [0.8, 0.25])
-def test_files_are_not_larger_than_demanded(flight, tmp_path, share):
+def test_files_are_not_larger_than_demanded(flight, tmp_path):
     full = write_flight(tmp_path / "full.rrd", flight, jobs=1)
     bare = write_flight(tmp_path / "bare.rrd", replace(flight, recording=None), jobs=1)
-    max_bytes = bare.num_bytes + share * (full.num_bytes - bare.num_bytes)
+    max_bytes = bare.num_bytes + 0.25 * (full.num_bytes - bare.num_bytes)
     small = write_flight(tmp_path / "small.rrd", flight, ViewContent(max_bytes=max_bytes), jobs=1)
     # What a file needs beside its images, 250 kB, is a large part of this small flight's size.
     assert 0.5 * max_bytes < small.num_bytes <= max_bytes
@@ -230,8 +219,9 @@ def test_a_recording_without_tracks_and_tracks_with_positions_alone(run, world, 
     entities = read_entities(tmp_path / "other.rrd")
     assert not any("ellipsoid" in path for path in entities)
     assert len(entities["/world/drones/1/body"]["Boxes3D:centers"][0]) == NUM_FRAMES
-    for path, component in (("body", "Boxes3D:centers"), ("trail", "LineStrips3D:strips")):
-        shown = dict(zip(*entities[f"/world/drones/0/{path}"][component], strict=True))
+    _, centres = entities["/world/drones/0/body"]["Boxes3D:centers"]
+    _, trails = entities["/world/drones/0/trail"]["LineStrips3D:strips"]
+    for shown in (centres, trails):
         assert shown[3] == shown[4] == []
         assert len(shown[6]) == 1
 
@@ -293,7 +283,8 @@ def test_the_page_for_a_browser(start_python, world):
 
 def test_cameras_on_drones_have_paths_and_markers(flight, tmp_path):
     white = np.full((240, 320, 3), 255, np.uint8)
-    marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 96)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    marker = cv2.aruco.generateImageMarker(dictionary, 7, 96)
     white[72:168, 100:196] = marker[..., None]
     with VideoWriter(tmp_path / "dron1.avi", 25.0, (320, 240)) as writer:
         for _ in range(5):
@@ -305,18 +296,20 @@ def test_cameras_on_drones_have_paths_and_markers(flight, tmp_path):
     flight = replace(flight, recording=replace(flight.recording, onboard=onboard))
     write_flight(tmp_path / "x.rrd", flight, ViewContent(onboard=True, dictionary="4x4_50"), jobs=1)
     entities = read_entities(tmp_path / "x.rrd")
-    places = np.array(entities["/world/onboard/dron1"]["Transform3D:translation"][1])[:, 0]
-    np.testing.assert_allclose(places, position_m)
+    camera = entities["/world/onboard/dron1"]
+    _, places = camera["Transform3D:translation"]
+    np.testing.assert_allclose(np.array(places)[:, 0], position_m)
     # Rerun keeps matrices column by column: the first column is where the camera's x axis points, y.
-    columns = np.array(entities["/world/onboard/dron1"]["Transform3D:mat3x3"][1])[:, 0]
-    np.testing.assert_allclose(columns[:, :3], [[0.0, 1.0, 0.0]] * 5, atol=1e-6)
-    assert len(entities["/world/onboard/dron1/image"]["EncodedImage:blob"][0]) == 5
+    _, matrices = camera["Transform3D:mat3x3"]
+    np.testing.assert_allclose(np.array(matrices)[:, 0, :3], [[0.0, 1.0, 0.0]] * 5, atol=1e-6)
+    frames, _ = entities["/world/onboard/dron1/image"]["EncodedImage:blob"]
+    assert len(frames) == 5
     markers = entities["/world/onboard/dron1/markers"]
     assert markers["LineStrips2D:labels"][1] == [["7"]] * 5
-    for strips in markers["LineStrips2D:strips"][1]:
+    for (outline,) in markers["LineStrips2D:strips"][1]:
         # Edges of the marker as pixels are counted from their corners; the codec blurs them by less than half a pixel.
-        np.testing.assert_allclose(strips[0][0], [100, 72], atol=0.5)
-        np.testing.assert_allclose(strips[0][2], [196, 168], atol=0.5)
+        np.testing.assert_allclose(outline[0], [100, 72], atol=0.5)
+        np.testing.assert_allclose(outline[2], [196, 168], atol=0.5)
 
 
 def test_rows_of_a_live_session_go_to_the_viewer(flight, tmp_path, monkeypatch):
@@ -331,24 +324,28 @@ def test_rows_of_a_live_session_go_to_the_viewer(flight, tmp_path, monkeypatch):
     with LiveView(flight.recording, web=True) as view:
         assert listening_at(os.getpid()) == {"127.0.0.1"}
         for frame in range(NUM_FRAMES):
-            view.write(tracks.at_frames(np.array([frame])))
+            row = tracks.at_frames(np.array([frame]))
+            view.write(row)
             view.show_delay(0.02)
-        last = tracks.at_frames(np.array([NUM_FRAMES - 1]))
-        gone = {"position_m": last.position_m * np.nan, "time_s": last.time_s + 0.04}
-        view.write(replace(last, frame=last.frame + 1, **gone))
+        nowhere_m = row.position_m * np.nan
+        gone = replace(row, frame=row.frame + 1, time_s=row.time_s + 0.04, position_m=nowhere_m)
+        view.write(gone)
     (port,) = re.findall(r"^http://127\.0\.0\.1:.*%3A(\d+)%2Fproxy", view.page)
     assert addresses == [f"rerun+http://127.0.0.1:{port}/proxy"]
     entities = read_entities(saved)
     # The drones are one entity, which the viewer gets in a tenth of the time of one entity per drone.
     body = entities["/world/drones/body"]
-    np.testing.assert_allclose(body["Boxes3D:centers"][1][:-1], tracks.position_m, atol=1e-6)
-    assert body["Boxes3D:centers"][1][-1] == [], "drones without a place are not shown"
+    *centres, last = body["Boxes3D:centers"][1]
+    np.testing.assert_allclose(centres, tracks.position_m, atol=1e-6)
+    assert last == [], "drones without a place are not shown"
     words = [word[0] for word in entities["/status/1"]["StateChange:state"][1]]
     assert words == ["tracked", "coasting", "tracked"]
     # Lines have the colours of the drones; a lost drone has none.
-    line, deviation = entities["/plots/deviation_mm"], 1e3 * np.sqrt(0.0056)
+    line = entities["/plots/deviation_mm"]
     assert line["SeriesLines:colors"][1][0] == body["Boxes3D:colors"][1][0]
-    expected_mm = np.where(np.arange(NUM_FRAMES + 1)[:, None] < [LOST_FROM, NUM_FRAMES], deviation, np.nan)
+    expected_mm = np.full((NUM_FRAMES + 1, 2), 1e3 * np.sqrt(0.0056))
+    expected_mm[LOST_FROM:, 0] = np.nan
+    expected_mm[NUM_FRAMES] = np.nan
     np.testing.assert_allclose(line["Scalars:scalars"][1], expected_mm, rtol=1e-6)
     # A trail begins with the drone and gets longer.
     trails = entities["/world/drones/trail"]["LineStrips3D:strips"][1]
