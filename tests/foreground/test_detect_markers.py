@@ -27,7 +27,8 @@ def opencv_markers(gray, dictionary, refinement):
     quads, ids, _ = detector.detectMarkers(gray)
     if ids is None:
         return []
-    return [(int(marker), quad[0]) for (marker,), quad in zip(ids, quads, strict=True)]
+    corners_px = [quad[0] for quad in quads]
+    return list(zip(ids.ravel().tolist(), corners_px, strict=True))
 
 
 def is_among(found, marker, quad):
