@@ -104,9 +104,9 @@ table5-quick: $(VENV)/.installed  ## a small form of Table 5: the smallest and t
 table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' own cameras and markers; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table7/table7.py $(if $(DATA),--data $(DATA))
 
-docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning and on a missing figure; names figures of another version of tracking
+docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning and on a figure of another version of tracking
 	@$(call install,docs)
-	@$(BIN)/python docs/readme.py --check || echo 'psotrack: older figures are said, and do not fail the build until each was made once by version 1' >&2
+	@$(BIN)/python docs/readme.py --check
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
