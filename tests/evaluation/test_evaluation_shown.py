@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clock_worlds import FPS, LATE_S, make_late_videos
-from evaluation_flights import NUM_FRAMES, ROUNDING, on_x_axis, with_covariance
+from evaluation_flights import NUM_FRAMES, ROUNDING, with_covariance
 from evaluation_flights import circling_flights as flights
 from helpers import make_once
 from matplotlib.figure import Figure
@@ -84,12 +84,6 @@ class TestOffsets:
         assert world.offset_m[2] == pytest.approx(ARM_M[2], abs=5e-3)
         largest_mm = 1e3 * max(body.offset_standard_error_m)
         assert f"drone's offset (body frame, known to {largest_mm:.1f} mm)" in tables.as_text(evaluation)
-
-    def test_one_frame_has_no_standard_error(self):
-        evaluation = evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0]))
-        (drone,) = evaluation.per_drone
-        assert (drone.offset_m, drone.offset_standard_error_m) == ((2, 0, 0), None)
-        assert "(world frame)" in tables.as_text(evaluation)
 
 
 class TestTable:

@@ -55,7 +55,9 @@ def pixels_by_opencv(camera, points_m):
     """(points, 2), pixels by OpenCV's own projection, as an oracle."""
     rotation, _ = cv2.Rodrigues(camera.T_cam_world[:3, :3])
     t_m, dist = camera.T_cam_world[:3, 3], np.array(camera.dist)
-    return cv2.projectPoints(np.ascontiguousarray(points_m), rotation, t_m, camera.K, dist)[0][:, 0]
+    points_m = np.ascontiguousarray(points_m)
+    pixels, _ = cv2.projectPoints(points_m, rotation, t_m, camera.K, dist)
+    return pixels[:, 0]
 
 
 @pytest.mark.parametrize(
@@ -64,7 +66,7 @@ def pixels_by_opencv(camera, points_m):
 def test_boxes_and_ellipses_are_about_the_drones_at_the_exposure(camera, offset_s, line_time_s):
     """The oracle projects points of surfaces by OpenCV, for a rolling shutter, a late camera, and a simple one."""
     rig = ring_rig(3, coefficients=5)
-    name, number = rig.names[camera], 6
+    name, number, seen_by = rig.names[camera], 6, rig.cameras[camera]
     late = FrameTimes(NUM_FRAMES, RATE_HZ, time_offset_s=offset_s)
     recording = recording_of(rig, times={name: late}, line_time_s={name: line_time_s})
     tracks = tracks_with()
@@ -80,18 +82,21 @@ def test_boxes_and_ellipses_are_about_the_drones_at_the_exposure(camera, offset_
     for drone in range(2):
         # Rows are exposed one after the other from the frame's time on. During the exposure of the drone, the row
         # itself moves by less than two rows, 1 mm of flight, 0.1 pixels.
-        row_px = pixels_by_opencv(rig.cameras[camera], position_m[number, drone][None])[0, 1] + 0.5
-        exposed_s = offset_s + line_time_s * row_px
-        at_m = position_m[number, drone] + exposed_s * velocity_m_s[0, 0]
-        pixels = pixels_by_opencv(rig.cameras[camera], at_m + sphere * SIZE_M[drone] / 2) + 0.5
+        place_m = position_m[number, drone]
+        ((_, row_px),) = pixels_by_opencv(seen_by, place_m[None])
+        exposed_s = offset_s + line_time_s * (row_px + 0.5)
+        at_m = place_m + exposed_s * velocity_m_s[0, 0]
+        pixels = pixels_by_opencv(seen_by, at_m + sphere * SIZE_M[drone] / 2) + 0.5
         expected = [*pixels.min(axis=0), *pixels.max(axis=0)]
         # 4,000 random points miss the outermost point of the surface by less than a fifth of a pixel.
         np.testing.assert_allclose(views.boxes_px[number, drone, camera], expected, atol=0.2)
 
-        half_m = np.sqrt(np.diag(tracks.covariance_m2[number, drone]) * chi2.ppf(0.9, 3))
-        off = pixels_by_opencv(rig.cameras[camera], at_m + sphere * half_m)
+        variance_m2 = np.diag(tracks.covariance_m2[number, drone])
+        half_m = np.sqrt(variance_m2 * chi2.ppf(0.9, 3))
+        off = pixels_by_opencv(seen_by, at_m + sphere * half_m)
         off -= views.middle_px[number, drone, camera]
-        radius2 = np.einsum("ni,ij,nj->n", off, np.linalg.inv(views.shape_px2[number, drone, camera]), off)
+        shape_px2 = views.shape_px2[number, drone, camera]
+        radius2 = (off @ np.linalg.inv(shape_px2) * off).sum(axis=1)
         # None is outside, some are at the border. The linear approximation is exact to the ellipsoid's size over its
         # distance, 15 cm of 4 m.
         assert 0.97 < radius2.max() < 1.12
@@ -116,8 +121,9 @@ def test_nine_of_ten_normal_points_are_inside_the_ellipsoid(seed):
     factor = rng.normal(size=(3, 3))
     covariance_m2 = np.stack([factor @ factor.T, np.full((3, 3), np.nan)])
     found = ellipsoids_90(covariance_m2)
-    own = rng.multivariate_normal(np.zeros(3), covariance_m2[0], 4000) @ found.rotation[0]
-    inside = (np.square(own / found.half_axes_m[0]).sum(axis=1) <= 1).mean()
+    points_m = rng.multivariate_normal(np.zeros(3), covariance_m2[0], 4000)
+    own = points_m @ found.rotation[0] / found.half_axes_m[0]
+    inside = np.mean(np.linalg.norm(own, axis=1) <= 1)
     # The standard deviation of the share is sqrt(0.9 * 0.1 / 4000) = 0.0047; six of it.
     assert abs(inside - 0.9) < 0.029
     np.testing.assert_allclose(np.linalg.det(found.rotation), 1.0, rtol=1e-9)
@@ -141,26 +147,19 @@ def test_events_of_the_status():
     assert events[2].text == "drone 1 is predicted for 0.24 s, without measurements"
 
 
-def test_events_of_the_record():
+def test_events_of_the_record_are_shown_at_their_times():
+    """Frame 4 of a camera of 12.5 Hz that begins 0.08 s late is exposed at 0.4 s: instant 10 of 25 Hz."""
     met = {"drones": [0, 1], "first_frame": 3, "closest_frame": 6, "distance_m": 0.31, "last_frame": 9}
     met |= {"log_odds": 5.0, "outcome": "swapped"}
-    events = find_events(flight_with({"encounters": [met], "left_out": {"c1": [[4, 6]]}}))
-    assert [(event.frame, event.text) for event in events] == [
-        (4, "camera c1 is left out in 2 frames: foreground is everywhere"),
-        (6, "drones 0 and 1 meet at 0.31 m; their labels: swapped"),
-    ]
-    np.testing.assert_allclose(events[1].position_m, tracks_with().position_m[6].mean(axis=0))
-
-
-def test_left_out_frames_of_a_late_slow_camera_are_shown_at_their_times():
-    """Frame 4 of a camera of 12.5 Hz that begins 0.08 s late is exposed at 0.4 s: instant 10 of 25 Hz."""
     slow = recording_of(ring_rig(2), times={"c1": FrameTimes(6, 12.5, time_offset_s=0.08)})
     # The second part begins behind the last frame.
-    events = find_events(flight_with({"left_out": {"c1": [[4, 6], [6, 9]]}}, slow))
-    assert [(event.frame, event.kind) for event in events] == [
-        (10, EventKind.LEFT_OUT),
-        (12, EventKind.LEFT_OUT),
-    ]
+    left_out = {"c1": [[4, 6], [6, 9]]}
+    first, second, third = find_events(flight_with({"encounters": [met], "left_out": left_out}, slow))
+    assert (first.frame, first.text) == (6, "drones 0 and 1 meet at 0.31 m; their labels: swapped")
+    np.testing.assert_allclose(first.position_m, tracks_with().position_m[6].mean(axis=0))
+    assert second.frame == 10
+    assert second.text == "camera c1 is left out in 2 frames: foreground is everywhere"
+    assert (third.frame, third.kind) == (12, EventKind.LEFT_OUT)
 
 
 def test_the_quality_of_cameras():

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 from evaluation_flights import circling_flights, on_x_axis
-from helpers import assert_refused, cameras_of, make_once, ring_rig
+from helpers import cameras_of, make_once, ring_rig
 from worlds import NUM_FRAMES, make_tracks
 
 import psotrack as pt
@@ -25,7 +25,7 @@ from psotrack.pipeline import TrackedRecording
 from psotrack.recordings import FrameTimes, Recording, Reference, view_in_images
 from psotrack.settings import TrackSettings
 from psotrack.show.flights import flight_of, read_flight
-from psotrack.show.reports import MOST_BYTES, MOST_ROWS, view_3d, write_flight_report, write_page
+from psotrack.show.reports import MOST_BYTES, MOST_ROWS, view_3d, write_flight_report
 from psotrack.show.reports.scene import scene_data
 from psotrack.tracking.identity import Identities
 from psotrack.trajectories import Status, Trajectories, summary_columns, write_trajectories
@@ -170,14 +170,6 @@ def test_without_a_recording_and_with_two_files_of_tracks(run_psotrack, reported
     assert run_psotrack("report", *words).code == 0
     assert text_of(two).count("<h2>Drones</h2>") == 2
     assert "There is no record of a run beside other." in text_of(two)
-
-
-def test_pages_are_small(tmp_path):
-    assert_refused(
-        lambda: write_page(tmp_path / "large.html", "x" * 9_000_000),
-        "expected a page of at most 8 MB, found 9.0 MB",
-        unchanged=tmp_path,
-    )
 
 
 # --- the 3D view
