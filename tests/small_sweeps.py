@@ -1,9 +1,7 @@
-"""Shared by the tests of sweeps: a very small sequence, whose program is compiled once, and ways to run psotrack."""
+"""Shared by the tests of sweeps: a very small sequence, whose program is compiled once."""
 
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -48,15 +46,6 @@ def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
 def environment(root: Path) -> dict[str, str]:
     """Environment of commands that use the cache in the small sequence's folder."""
     return os.environ | COMPILER | {"PSOTRACK_CACHE": str(root / "cache")}
-
-
-def psotrack(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run `psotrack WORDS` with the caches in the small sequence's folder, and wait until it has ended.
-
-    No test kills a process from outside: a process that is to be killed kills itself at a place in the program.
-    """
-    command = [sys.executable, "-m", "psotrack", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment(root) | more, check=False)
 
 
 def wait_until(happened: Callable[[], object]) -> None:

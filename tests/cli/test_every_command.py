@@ -247,14 +247,12 @@ SETTINGS = st.fixed_dictionaries(
     {},
     optional={
         "swarm.particles": st.integers(2, 100_000),
-        "motion.max_speed_m_s": st.floats(1e-3, 1e9),
         # Files have no numbers above 1e60.
         "rate_hz": st.floats(1e-300, 1e60),
         "drones.size_m": st.tuples(*[st.floats(1e-3, 1e9)] * 3),
         "clocks": st.sampled_from(["given", "auto"]),
         "method": texts,
         "smooth": st.booleans(),
-        "silhouettes.reduction": st.integers(1, 64),
     },
 )
 
@@ -277,28 +275,25 @@ def test_a_run_that_fails_saves_no_config(run: Run, tmp_path: Path) -> None:
 def test_the_table_of_drones_has_eighty_columns_and_no_cell_is_cut(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    names = (*map(str, range(10)), "[red]a drone with a long name")
-    drones, frames = len(names), 40
+    long_name = "[red]a drone with a long name"
+    frames = 40
     tracks = Trajectories(
         np.arange(frames),
         # Times of more than a day, and 12 m of standard deviation.
         90_000 + np.arange(frames) / 25,
-        names,
-        np.ones((frames, drones, 3)),
-        status=np.full((frames, drones), Status.TRACKED),
-        covariance_m2=np.tile(144.0 * np.eye(3), (frames, drones, 1, 1)),
-        num_cameras=np.full((frames, drones), 40),
+        ("0", long_name),
+        np.ones((frames, 2, 3)),
+        status=np.full((frames, 2), Status.TRACKED),
+        covariance_m2=np.tile(144.0 * np.eye(3), (frames, 2, 1, 1)),
+        num_cameras=np.full((frames, 2), 40),
     )
-    for hidden in (Printer(quiet=True), Printer(json_path=Path("-"))):
-        hidden.drones(tracks)
-    assert capsys.readouterr().out == ""
-    Printer().drones(tracks, np.full((drones, 3), 1.234))
+    Printer().drones(tracks, np.full((2, 3), 1.234))
     lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    rows = {line.split()[0]: line.split()[1:] for line in lines if line[:1].isdigit()}
-    first = ["100.0%", "0.0%", "0.0%", "40.0", "12000", "123", "123", "123", "90000", "90002"]
-    assert rows["0"] == first
+    for line in lines:
+        assert len(line) <= 80
+    number = next(number for number, line in enumerate(lines) if line.startswith("0 "))
+    expected = "0 100.0% 0.0% 0.0% 40.0 12000 123 123 123 90000 90002"
+    assert lines[number].split() == expected.split()
     # The long name is folded, not cut, and no part of it is a style.
-    last = next(number for number, line in enumerate(lines) if line.startswith("9 "))
-    folded = "".join(line.partition("100.0%")[0] for line in lines[last + 1 :])
-    assert folded.replace(" ", "") == names[-1].replace(" ", "")
+    folded = "".join(line.partition("100.0%")[0] for line in lines[number + 1 :])
+    assert folded.replace(" ", "") == long_name.replace(" ", "")

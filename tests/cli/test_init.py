@@ -295,13 +295,6 @@ def test_an_empty_answer_and_ctrl_c_leave_everything_as_it_was(ask, folder, comm
     assert content_of(path) == before
 
 
-def test_videos_of_one_camera_are_asked_for(ask, folder):
-    """The cameras are those that only their files name."""
-    path = folder("cam1.avi", "cam_1.avi")
-    assert ask("init", path, "1", "second").code == 0
-    assert videos_of(path) == {"cam1": "cam_1.avi", "second": "cam1.avi"}
-
-
 # --- what is not clear
 
 #: Files and options, cameras of rig.toml -> words of the line.
@@ -325,7 +318,6 @@ BAD = {
     ),
     ("", "cam1"): ("expected files named like the cameras of rig.toml, cam1, found none",),
     ("", ""): ("expected videos, folders of images, or detections, found none",),
-    ("cam1.avi cam1/0.png", "cam1"): ("expected one video of camera cam1, found cam1 as well",),
     ("cam1.avi calibration.toml", "cam1"): (
         "expected one rig file, found calibration.toml, rig.toml; name the one",
     ),
@@ -342,9 +334,6 @@ BAD = {
     ("cam1.avi --match cam1=rig.toml", "cam1"): ("--match: expected a video, ", " found rig.toml"),
     ("cam1.avi b.avi --match cam1=cam1.avi --match cam1=b.avi", "cam1"): (
         "--match: expected one video of camera cam1, found two",
-    ),
-    ("b.avi --match cam1=b.avi --match cam1=b.avi", "cam1"): (
-        "--match: expected each file once, found b.avi 2 times",
     ),
     ("cam1.avi --leave-out no.avi", "cam1"): ("--leave-out: expected a file in", "flight, found no.avi"),
     ("cam1.avi --out a.txt", "cam1"): ("--out: expected a file that ends in .toml",),

@@ -15,7 +15,6 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import worlds
 from helpers import assert_refused, content_of, files_up_to
@@ -24,13 +23,7 @@ from hypothesis import strategies as st
 from small_sweeps import grid_file, small_sequence, stamps
 
 from psotrack.errors import InputError
-from psotrack.foreground.detection import LabelSettings, write_data_set
-from psotrack.foreground.silhouettes import masks_out
-from psotrack.live import recording_folder
-from psotrack.recordings.datasets import open_recording
-from psotrack.recordings.exchange import Footage, export_tracks
-from psotrack.show.flights import TrackedFlight
-from psotrack.show.overlay import write_overlays
+from psotrack.recordings.exchange import export_tracks
 from psotrack.support import check_file_name
 
 #: What is there before -> words of the command that would replace it.
@@ -308,27 +301,6 @@ def test_commands_that_name_files_like_cameras(words, flight, place, run_psotrac
         file.write_text(file.read_text().replace("[cameras.c0]", '[cameras."../evil"]'))
     words = words.format(lab=lab).split()
     assert_refused(lambda: run_psotrack(*words), lab, "../evil", unchanged=place)
-
-
-def test_names_of_cameras_that_python_built(flight, tmp_path):
-    """Files have names that are checked; Python may build a recording with any."""
-    recording = open_recording(flight)
-    first, *others = recording.cameras
-    recording = replace(recording, cameras=(replace(first, name="../evil"), *others))
-    other = replace(recording, name="other")
-    out = tmp_path / "in" / "out"
-    footage = Footage(recording, np.full((2, 3), 0.3))
-    labels = LabelSettings((0.3, 0.3, 0.1))
-    for write in (
-        lambda: write_overlays(out, TrackedFlight("flight", (), recording)),
-        lambda: masks_out(out, ("a", "../evil")),
-        lambda: write_data_set([recording, other], out, labels),
-        lambda: export_tracks(worlds.make_tracks(), "mot", out, footage=footage),
-        lambda: recording_folder(out, recording, recording.rig.names).__enter__(),
-    ):
-        with pytest.raises(InputError, match=r"found '(flight[-_])?\.\./evil'"):
-            write()
-        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 # --- results that are made of several files, and disks that cannot be written

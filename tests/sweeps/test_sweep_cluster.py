@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 from helpers import assert_refused, listening_at
-from small_sweeps import all_rows, environment, grid_file, psotrack, small_sequence, wait_until
+from small_sweeps import all_rows, environment, grid_file, small_sequence, wait_until
 
 from psotrack.sweeps import Cluster, Inputs, Store, cluster, read_grid
 
 pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
 psutil = pytest.importorskip("psutil", reason="comes with Dask")
 
 #: Code that every worker runs first: one worker kills itself just before it moves its cell's file to its place.
@@ -42,21 +43,27 @@ main()
 
 
 @pytest.mark.slow
-def test_a_worker_is_killed_and_its_cell_runs_again(run_psotrack, tmp_path_factory, tmp_path):
+def test_a_worker_is_killed_and_its_cell_runs_again(start_python, run_psotrack, tmp_path_factory, tmp_path):
     root, results, died = small_sequence(tmp_path_factory), tmp_path / "results", tmp_path / "died"
-    (tmp_path / "dying.py").write_text(DYING)
-    dask = {"WORKER__PRELOAD": str(tmp_path / "dying.py")}
-    # The test must not fail on a slow machine: Dask's default timeout is half a minute.
-    dask |= {"COMM__TIMEOUTS__CONNECT": "600s", "COMM__TIMEOUTS__TCP": "600s"}
-    more = {f"DASK_DISTRIBUTED__{name}": value for name, value in dask.items()} | {"DIED": str(died)}
+    dying = tmp_path / "dying.py"
+    dying.write_text(DYING)
+    more = {
+        "DIED": str(died),
+        "DASK_DISTRIBUTED__WORKER__PRELOAD": str(dying),
+        # The test must not fail on a slow machine: Dask's default timeout is half a minute.
+        "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "600s",
+        "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP": "600s",
+    }
     words = ("sweep", grid_file(tmp_path, [2, 3, 4]), "--data", root, "--out", results, "--json", "-")
-    done = psotrack(root, *words, "--cluster", "local", "--workers", 2, **more)
-    assert done.returncode == 0, done.stderr
+    local = ("--cluster", "local", "--workers", 2)
+    process = start_python("-m", "psotrack", *words, *local, env=environment(root) | more)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
     assert died.exists()
-    assert json.loads(done.stdout) == {"finished": 3, "failed": 0, "left": 0}
+    assert json.loads(out) == {"finished": 3, "failed": 0, "left": 0}
     assert sorted(all_rows(results)["settings.swarm.iterations"]) == [2, 3, 4]
-    (run,) = (json.loads(path.read_text()) for path in (results / "_runs").glob("*.json"))
-    assert run["cells"] == 3
+    (noted,) = (results / "_runs").glob("*.json")
+    assert json.loads(noted.read_text())["cells"] == 3
     # All cells are finished, so no cluster is needed, and the address without a cluster is no error.
     again = run_psotrack(*words, "--cache", root / "cache", "--cluster", "tcp://127.0.0.1:1")
     assert json.loads(again.out) == {"finished": 0, "failed": 0, "left": 3}
@@ -130,7 +137,7 @@ def _certificates(folder: Path) -> dict[str, str]:
 
 @pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
-def test_a_sweep_on_a_cluster_with_tls(start_python, tmp_path_factory, tmp_path):
+def test_a_sweep_on_a_cluster_with_tls(start_python, run_psotrack, tmp_path_factory, tmp_path):
     """The commands of the page about clusters: a scheduler and a worker with TLS, and a sweep."""
     root, tls = small_sequence(tmp_path_factory), _certificates(tmp_path)
     file = tmp_path / "scheduler.json"
@@ -141,10 +148,14 @@ def test_a_sweep_on_a_cluster_with_tls(start_python, tmp_path_factory, tmp_path)
     address = json.loads(file.read_text())["address"]
     assert address.startswith("tls://127.0.0.1:")
     start("distributed.cli.dask_worker", "--nthreads", "1", *listening)
-    words = ("sweep", grid_file(tmp_path, [2]), "--data", root, "--cluster", address, "--json", "-")
-    done = psotrack(root, *words, "--out", tmp_path / "results", **tls)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == {"finished": 1, "failed": 0, "left": 0}
-    stranger = psotrack(root, *words, "--out", tmp_path / "other")
-    assert stranger.returncode == 2
-    assert stranger.stderr.startswith("psotrack: --cluster: expected a Dask scheduler"), stranger.stderr
+    grid = grid_file(tmp_path, [2])
+    words = ("sweep", grid, "--data", root, "--cache", root / "cache", "--cluster", address, "--json", "-")
+    # What Dask reads in the variables when it is imported.
+    names = [name.removeprefix("DASK_").lower().replace("__", ".") for name in tls]
+    with dask.config.set(dict(zip(names, tls.values(), strict=True))):
+        done = run_psotrack(*words, "--out", tmp_path / "results")
+    assert done.code == 0, done.err
+    assert json.loads(done.out) == {"finished": 1, "failed": 0, "left": 0}
+    stranger = run_psotrack(*words, "--out", tmp_path / "other")
+    assert stranger.code == 2
+    assert stranger.err.startswith("psotrack: --cluster: expected a Dask scheduler")

@@ -74,21 +74,16 @@ def test_rows_of_more_seeds_are_added_and_a_seed_that_is_run_again_replaces_its_
 
 def test_only_the_input_that_was_used_last_counts(store: Store) -> None:
     """Rows of an older tracker, or of another recording, stay in the folder and are not mixed with the others."""
-    for age, (key, error_m) in enumerate((("a-new", 2.0), ("a-old", 1.0), ("b-old", 3.0))):
+    for age_s, key, error_m in ((0, "a-new", 2.0), (1, "a-old", 1.0), (2, "b-old", 3.0)):
         store.add(key, rows(0, error_m=error_m))
-        os.utime(store.folder / "cells" / f"{key}.parquet", (1000 - age, 1000 - age))
+        used_s = 1000 - age_s
+        os.utime(store.folder / "cells" / f"{key}.parquet", (used_s, used_s))
     assert store.rows()["mean_error_m"].tolist() == [2.0, 3.0]
     assert store.status()["finished"] == 2
     # The older tracker is used again.
     store.use("a-old")
     assert store.rows()["mean_error_m"].tolist() == [1.0, 3.0]
     assert store.rows({"a-new": [0]})["mean_error_m"].tolist() == [2.0]
-
-
-def test_cells_are_sorted_by_their_settings(store: Store) -> None:
-    for key, particles in (("c", 20), ("a", 100), ("b", 3)):
-        store.add(key, rows(0).assign(sequence="S01", **{"settings.swarm.particles": particles}))
-    assert store.rows()["settings.swarm.particles"].tolist() == [3, 20, 100]
 
 
 def test_the_folder_is_a_parquet_data_set_of_the_rows(store: Store) -> None:
