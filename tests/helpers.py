@@ -17,7 +17,7 @@ from psotrack.errors import LONGEST_MESSAGE, PsotrackError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
 from psotrack.recordings import CameraRecording, Recording
-from psotrack.settings import TrackSettings, setting_names
+from psotrack.settings import TrackSettings, full_name
 
 #: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
 LENSES = {
@@ -218,21 +218,20 @@ def sphere_points(count):
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=-1)
 
 
-#: Bytes of a camera -> (height, width, 2) undistorted coordinates of its pixels; NaN where not yet computed.
-_NORMALISED: dict[tuple[bytes, ...], np.ndarray] = {}
+#: Bytes of a lens -> (height, width, 3) directions of the rays through the centres of its pixels, in its axes.
+_RAYS: dict[tuple[bytes, ...], np.ndarray] = {}
 
 
-def _normalised_pixels(camera, size_wh, rows, columns):
-    """(rows, columns, 2), undistorted coordinates of the pixels in a window; each is computed once per camera."""
-    parts = (camera.K, camera.dist, np.asarray(camera.fisheye, float), size_wh)
+def _rays(camera, size_wh):
+    """Directions of the rays through the pixels; they are computed once per lens."""
+    parts = (camera.K, camera.dist, camera.fisheye, size_wh)
     key = tuple(np.asarray(part).tobytes() for part in parts)
-    stored = _NORMALISED.setdefault(key, np.full((size_wh[1], size_wh[0], 2), np.nan))
-    window = stored[rows, columns]
-    y, x = np.nonzero(np.isnan(window[..., 0]))
-    if len(x):
-        pixels = np.stack([x + columns.start, y + rows.start], axis=-1).astype(float)
-        window[y, x] = undistort(camera, pixels)
-    return window
+    if key not in _RAYS:
+        x, y = np.meshgrid(np.arange(size_wh[0]), np.arange(size_wh[1]))
+        points = undistort(camera, np.stack([x, y], axis=-1).astype(float))
+        ahead = np.ones((*points.shape[:2], 1))
+        _RAYS[key] = np.concatenate([points, ahead], axis=-1)
+    return _RAYS[key]
 
 
 def draw_coverage(rig: Rig, position_m, size_m, reduction):
@@ -240,36 +239,22 @@ def draw_coverage(rig: Rig, position_m, size_m, reduction):
 
     A pixel is foreground if its ray meets an ellipsoid. The function does not use `boxes`, so it can test that module.
     """
-    position_m, size_m = np.atleast_2d(position_m), np.atleast_2d(size_m)
+    position_m = np.atleast_2d(position_m)
+    size_m = np.broadcast_to(size_m, position_m.shape)
     width, height = rig.cameras.image_size_wh[0].astype(int)
     foreground = np.zeros((len(rig), height, width), bool)
     for index in range(len(rig)):
         camera = rig.cameras[index]
-        R = camera.T_cam_world[:3, :3]
-        for centre, size in zip(position_m, np.broadcast_to(size_m, position_m.shape), strict=True):
-            pixel, depth = project(camera, centre)
+        rays = _rays(camera, (width, height)) @ camera.T_cam_world[:3, :3]
+        for centre, size in zip(position_m, size_m, strict=True):
+            _, depth = project(camera, centre)
             if depth < size.max():
                 continue
-            # An outline is one piece: if it does not cross the border of the smaller window, it is within the window.
-            for factor in (0.8, 2.0):
-                reach = factor * camera.K[1, 1] * size.max() / max(depth, 0.1)
-                (x0, y0), (x1, y1) = (
-                    np.clip(np.floor(pixel + sign * reach), 0, (width, height)).astype(int)
-                    for sign in (-1, 1)
-                )
-                if x0 >= x1 or y0 >= y1:
-                    continue
-                points = _normalised_pixels(camera, (width, height), slice(y0, y1), slice(x0, x1))
-                ray = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1) @ R
-                # In units of the semi-axes the ellipsoid is the unit sphere.
-                ray, start = ray / (size / 2), (camera.centre_world - centre) / (size / 2)
-                hit = (ray @ start) ** 2 >= (ray * ray).sum(axis=-1) * (start @ start - 1)
-                inside = np.zeros_like(hit)
-                inside[int(y0 > 0) : y1 - y0 - (y1 < height), int(x0 > 0) : x1 - x0 - (x1 < width)] = True
-                if hit.any() and not hit[~inside].any():
-                    break
-            if x0 < x1 and y0 < y1:
-                foreground[index, y0:y1, x0:x1] |= hit
+            # In units of the semi-axes the ellipsoid is the unit sphere.
+            scaled = rays / (size / 2)
+            start = (camera.centre_world - centre) / (size / 2)
+            squared = (scaled * scaled).sum(axis=-1)
+            foreground[index] |= (scaled @ start) ** 2 >= squared * (start @ start - 1)
     cells = foreground.reshape(len(rig), height // reduction, reduction, width // reduction, reduction)
     return np.round(255 * cells.mean(axis=(2, 4))).astype(np.uint8)
 
@@ -302,10 +287,8 @@ SHORT_NAMES = {
 
 def track_settings(**options):
     """Tracking settings by their last names, such as `particles`, by `SHORT_NAMES`, or by dotted names."""
-    last = {name.rpartition(".")[2]: name for name in reversed(setting_names())}
-    return TrackSettings().changed(
-        {SHORT_NAMES.get(name) or last.get(name, name): value for name, value in options.items()}
-    )
+    named = {SHORT_NAMES.get(name, name): value for name, value in options.items()}
+    return TrackSettings().changed({full_name(name): value for name, value in named.items()})
 
 
 def points_in_room(*shape, seed=0):

@@ -97,23 +97,27 @@ def column_names(pattern, corners="1234"):
 OUR_COLUMNS = column_names("{axis}{corner}[m]")
 
 
-def wide_table(corners_m, header=OUR_COLUMNS, *, scale=1.0, separator=";"):
-    """Text of a table with a row for each marker; without a header if it is None."""
-    lines = [separator.join(header)] if header else []
-    for marker, corners in corners_m.items():
-        values = (repr(float(scale * value)) for value in corners.ravel())
-        lines.append(separator.join([str(marker), *values]))
+def _table(header, rows, separator):
+    """Text of a table; without a header if it is None."""
+    lines = [separator.join(map(str, row)) for row in rows]
+    if header:
+        lines.insert(0, separator.join(header))
     return "\n".join(lines) + "\n"
+
+
+def wide_table(corners_m, header=OUR_COLUMNS, *, scale=1.0, separator=";"):
+    """Text of a table with a row for each marker."""
+    rows = [(marker, *(scale * corners).ravel()) for marker, corners in corners_m.items()]
+    return _table(header, rows, separator)
 
 
 def long_table(corners_m, header, corner_names="1234", *, scale=1.0, separator=","):
     """Text of a table with a row for each corner."""
-    lines = [separator.join(header)] if header else []
+    rows = []
     for marker, corners in corners_m.items():
         for name, corner in zip(corner_names, corners, strict=True):
-            values = (repr(float(scale * value)) for value in corner)
-            lines.append(separator.join([str(marker), name, *values]))
-    return "\n".join(lines) + "\n"
+            rows.append((marker, name, *(scale * corner)))
+    return _table(header, rows, separator)
 
 
 def found_markers(ids, corners_px, std_px=np.nan):

@@ -3,8 +3,6 @@
 The field numbers are from onnx.proto. Protobuf's wire format has varints, and bytes preceded by their length.
 """
 
-import struct
-
 import numpy as np
 
 _FLOAT, _INT64 = 1, 7
@@ -21,11 +19,9 @@ def _varint(value: int) -> bytes:
 
 
 def _field(number: int, value) -> bytes:
-    """Encode one field: an int as a varint, a float in four bytes, other values preceded by their length."""
+    """Encode one field: an int as a varint, other values preceded by their length."""
     if isinstance(value, int):
         return _varint(number << 3) + _varint(value)
-    if isinstance(value, float):
-        return _varint(number << 3 | 5) + struct.pack("<f", value)
     content = value.encode() if isinstance(value, str) else value
     return _varint(number << 3 | 2) + _varint(len(content)) + content
 
@@ -96,28 +92,27 @@ def bright_squares(layout: str, size: int) -> bytes:
         "flat": np.array([1, 1, n], np.int64),
         "boxes": (corners if layout == "v10" else middles)[None].astype(np.float32),
         "one": np.ones((1, 1, n), np.float32),
+        "zero": np.zeros((1, 1, n), np.float32),
+        "first": np.arange(300, dtype=np.int64),
     }
+    kernel_shape, strides = [SIDE, SIDE], [STRIDE, STRIDE]
     nodes = [
-        _node(
-            "Conv", ["images", "kernel", "bias"], "sums", kernel_shape=[SIDE, SIDE], strides=[STRIDE, STRIDE]
-        ),
+        _node("Conv", ["images", "kernel", "bias"], "sums", kernel_shape=kernel_shape, strides=strides),
         _node("Identity" if layout == "logits" else "Sigmoid", ["sums"], "map"),
         _node("Reshape", ["map", "flat"], "scores"),
     ]
+    shape = (1, 3, size, size)
+    if layout == "none":
+        nodes.append(_node("Identity", ["map"], "output"))
+        return model(nodes, tensors, shape, (1, 1, cells, cells))
     if layout in ("v8", "logits"):
         # Two classes; the score of the first class is always 0.
-        tensors["zero"] = np.zeros((1, 1, n), np.float32)
         nodes.append(_node("Concat", ["boxes", "zero", "scores"], "output", axis=1))
-        return model(nodes, tensors, (1, 3, size, size), (1, 6, n))
-    if layout == "v5":
-        nodes.append(_node("Concat", ["boxes", "scores", "one"], "columns", axis=1))
-        nodes.append(_node("Transpose", ["columns"], "output", perm=[0, 2, 1]))
-        return model(nodes, tensors, (1, 3, size, size), (1, n, 6))
+        return model(nodes, tensors, shape, (1, 6, n))
+    nodes.append(_node("Concat", ["boxes", "scores", "one"], "columns", axis=1))
+    chosen = "columns"
     if layout == "v10":
-        tensors["first"] = np.arange(300, dtype=np.int64)
-        nodes.append(_node("Concat", ["boxes", "scores", "one"], "columns", axis=1))
-        nodes.append(_node("Gather", ["columns", "first"], "chosen", axis=2))
-        nodes.append(_node("Transpose", ["chosen"], "output", perm=[0, 2, 1]))
-        return model(nodes, tensors, (1, 3, size, size), (1, 300, 6))
-    nodes.append(_node("Identity", ["map"], "output"))
-    return model(nodes, tensors, (1, 3, size, size), (1, 1, cells, cells))
+        chosen, n = "chosen", 300
+        nodes.append(_node("Gather", ["columns", "first"], chosen, axis=2))
+    nodes.append(_node("Transpose", [chosen], "output", perm=[0, 2, 1]))
+    return model(nodes, tensors, shape, (1, n, 6))

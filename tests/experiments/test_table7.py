@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pandas as pd
 import pytest
 from helpers import Run, make_once
 
-from psotrack.inside_out import MarkerMap
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 
 EXPERIMENT = Path(__file__).parents[2] / "experiments" / "table7"
@@ -60,19 +58,3 @@ def test_tables_rows_and_a_second_run(run_program: Run, data: Path, tmp_path: Pa
     before = kept.stat().st_mtime_ns
     assert run_program(EXPERIMENT / "table7.py", "--data", data, "--out", tmp_path).code == 0
     assert kept.stat().st_mtime_ns == before
-
-
-def test_markers_with_wrong_ids(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(EXPERIMENT)
-    from _sightings import Sightings, mislabelled
-
-    known, square_m = np.arange(30), np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
-    marker_map = MarkerMap({number: square_m + number for number in known.tolist()})
-    ids = np.tile([*known, 500], 200)
-    seen = Sightings(np.arange(len(ids)) // 31, ids, np.zeros((len(ids), 4, 2)), np.zeros(len(ids)))
-    found = mislabelled(seen, 0.02, marker_map, np.random.default_rng(3))
-    # Of 6,000 with a probability of 2 %: 120, with a standard deviation of 11.
-    assert 85 < (found.ids != ids).sum() < 155
-    assert (found.ids[ids == 500] == 500).all()
-    assert set(found.ids) == set(ids)
-    assert mislabelled(seen, 0.0, marker_map, np.random.default_rng(3)).ids.tolist() == ids.tolist()

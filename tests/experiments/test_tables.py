@@ -10,7 +10,6 @@ import small_sweeps
 from helpers import Run
 
 from psotrack.show.flights import colour_rgb
-from psotrack.simulation import build, load
 from psotrack.support import COLOURS
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -95,9 +94,3 @@ def test_from_videos_to_tracks(run: Run, data: Path, tmp_path: Path) -> None:
     assert (row["drones"] >= 1, row["cameras"], row["video_s"]) == (True, 8, 0.24)
     assert 0 < row["real_time_factor"] < row["real_time_factor_running"]
     assert min(row["decode_s"], row["track_s"]) > 0
-
-
-def test_the_scenario_of_the_reference_table_can_be_flown() -> None:
-    """Its recorded landing is a file beside it, which nothing else reads."""
-    recipe = load(EXPERIMENTS / "accuracy" / "comings_and_goings.toml")
-    assert len(build(recipe).flights) == 5

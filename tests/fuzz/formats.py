@@ -177,8 +177,8 @@ def _open(path: Path) -> object:
     return datasets.open_recording(path.parent).usable()
 
 
-def _part(file: str, *reads: Read, make: Callable[[Path], object] = _recording) -> Format:
-    return Format(make, file, (_open, *reads), _INFO, is_slow=True)
+def _part(file: str, *reads: Read) -> Format:
+    return Format(_recording, file, (_open, *reads), _INFO, is_slow=True)
 
 
 def _dpjait(folder: Path) -> None:
@@ -208,7 +208,7 @@ _RECORDINGS = {
     "recording-times": _part("times.csv", recordings.read_timestamps),
     "recording-c3d": _part("mocap.c3d", mocap.read_c3d),
     "recording-video": _part("c0.avi"),
-    "recording-reference": _part("dron1.csv", make=worlds.make_sequence),
+    "recording-reference": Format(worlds.make_sequence, "dron1.csv", (_open,), _INFO, is_slow=True),
     "dpjait-calibration": _published("cameras_calibration.csv"),
     "dpjait-poses": _published("dron1_pos_25.csv"),
     "dpjait-boxes": _published("dl_data/cam2i_s.csv", recordings.read_detections),

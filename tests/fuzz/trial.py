@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
+from typing import NamedTuple
 
 from fuzz.formats import FORMATS, make_all
 from fuzz.mutations import mutate
@@ -35,8 +36,8 @@ SECONDS, MEBIBYTES = 2.0, 256
 COMMANDS = 0.05
 
 
-#: Streams of Python to the file descriptors, whatever else pytest has made of `sys.stdout`.
-_STREAMS = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+#: Stream of Python to the file descriptor, whatever else pytest has made of `sys.stderr`.
+_STDERR = open(2, "w", closefd=False)  # noqa: SIM115
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,9 @@ class Trial:
     content: bytes = field(repr=False)
 
 
-@dataclass
-class _Cost:
-    seconds: float = 0.0
-    mebibytes: float = 0.0
+class _Cost(NamedTuple):
+    seconds: float
+    mebibytes: float
 
 
 class Judge:
@@ -114,60 +114,56 @@ class Judge:
     def _run(
         self, path: Path, name: str, read: Callable | None, limit: _Cost | None
     ) -> tuple[str, bool, _Cost]:
+        """The fault, whether the file was refused, and the cost."""
+        folder = self._seeds / name
         shutil.rmtree(self._out, ignore_errors=True)
         self._out.mkdir()
-        before = _listing(self._seeds / name)
+        before = _listing(folder)
         held = _begin_memory()
         began_s = time.process_time()
         with _captured() as said:
             message, fault = self._command(name, path) if read is None else _function(read, path)
-        cost = _Cost(time.process_time() - began_s, _peak_memory() - held)
-        text = said()
-        allowed = read is None
-        if not fault and message is not None:
-            fault = _wrong_message(message, path, self._seeds / name)
-        lines = text.splitlines()
-        if not fault and allowed and message is not None:
-            lines = lines[:-1]
-        strange = [line for line in lines if not (allowed and line.startswith("psotrack: warning: "))]
-        if not fault and strange:
-            fault = f"stderr: {strange[0][:300]}"
-        if not fault and _listing(self._seeds / name) != before:
-            fault = "a file beside the input was written or changed"
-        if not fault and message is not None and any(self._out.iterdir()):
-            fault = f"written in spite of the error: {sorted(self._out.rglob('*'))[:3]}"
-        if not fault and limit is not None:
-            # Memory first: where the machine has little of it, it also takes time.
-            if cost.mebibytes > 2 * limit.mebibytes + MEBIBYTES:
-                fault = f"took {cost.mebibytes:.0f} MiB instead of {limit.mebibytes:.0f} MiB"
-            elif cost.seconds > 2 * limit.seconds + SECONDS:
-                fault = f"took {cost.seconds:.1f} s instead of {limit.seconds:.1f} s"
-        return fault, message is not None, cost
+        cost = _Cost(time.process_time() - began_s, _memory("VmHWM:") - held)
+        lines = said().splitlines()
+        is_refused = message is not None
+        if read is None:
+            if is_refused:
+                message = lines.pop() if lines else ""
+                if not message.startswith("psotrack: "):
+                    fault = fault or f"stderr ends with {message!r}"
+            lines = [line for line in lines if not line.startswith("psotrack: warning: ")]
+        faults = [fault]
+        if is_refused:
+            faults.append(_wrong_message(message, path, folder))
+        if lines:
+            faults.append(f"stderr: {lines[0][:300]}")
+        if _listing(folder) != before:
+            faults.append("a file beside the input was written or changed")
+        if is_refused and any(self._out.iterdir()):
+            faults.append(f"written in spite of the error: {sorted(self._out.rglob('*'))[:3]}")
+        # Memory first: where the machine has little of it, it also takes time.
+        if limit is not None and cost.mebibytes > 2 * limit.mebibytes + MEBIBYTES:
+            faults.append(f"took {cost.mebibytes:.0f} MiB instead of {limit.mebibytes:.0f} MiB")
+        if limit is not None and cost.seconds > 2 * limit.seconds + SECONDS:
+            faults.append(f"took {cost.seconds:.1f} s instead of {limit.seconds:.1f} s")
+        return next(filter(None, faults), ""), is_refused, cost
 
     def _command(self, name: str, path: Path) -> tuple[str | None, str]:
-        """The error that a command prints, and the fault."""
-        words = FORMATS[name].command.split()
-        folder = self._seeds / name
-        arguments = [
-            each.replace("{file}", str(path))
-            .replace("{folder}", str(folder))
-            .replace("{out}", str(self._out))
-            for each in words
-        ]
+        """A text where a command refuses the file, whose message is on stderr; and the fault."""
+        places = {"{file}": path, "{folder}": self._seeds / name, "{out}": self._out}
+        words = ["psotrack"]
+        for word in FORMATS[name].command.split():
+            for place, whole in places.items():
+                word = word.replace(place, str(whole))
+            words.append(word)
         before = sys.argv
-        sys.argv = ["psotrack", *arguments]
+        sys.argv = words
         try:
             cli.main()
         except SystemExit as stop:
             if stop.code in (0, None):
                 return None, ""
-            sys.stderr.flush()
-            with open(2, "rb", closefd=False) as file:
-                file.seek(0)
-                lines = file.read().decode("utf-8", "replace").splitlines()
-            if stop.code != 2 or not lines or not lines[-1].startswith("psotrack: "):
-                return "", f"exit code {stop.code}, stderr {lines[-1:]}"
-            return lines[-1], ""
+            return "", "" if stop.code == 2 else f"exit code {stop.code}"
         except BaseException as error:
             return "", _trace(error)
         finally:
@@ -205,44 +201,35 @@ def _wrong_message(message: str, path: Path, folder: Path) -> str:
     return ""
 
 
-def _listing(folder: Path) -> list[tuple[str, int, int]]:
+def _listing(folder: Path) -> list[tuple[Path, int, int]]:
     found = []
-    for root, folders, files in os.walk(folder):
-        for each in (*folders, *files):
-            status = os.stat(os.path.join(root, each))
-            found.append((os.path.join(root, each), status.st_size, status.st_mtime_ns))
+    for path in folder.rglob("*"):
+        status = path.stat()
+        found.append((path, status.st_size, status.st_mtime_ns))
     return sorted(found)
 
 
 @contextlib.contextmanager
 def _captured() -> Iterator[Callable[[], str]]:
-    """Take what the process writes to stdout and stderr; the function gives the text of stderr."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    kept, streams = (os.dup(1), os.dup(2)), (sys.stdout, sys.stderr)
+    """Take what the process writes to stderr, libraries included; the function gives the text."""
+    kept, stream = os.dup(2), sys.stderr
     text = ""
-    with (
-        tempfile.TemporaryFile() as out,
-        tempfile.TemporaryFile() as err,
-        warnings.catch_warnings(record=True) as warned,
-    ):
+    with tempfile.TemporaryFile() as file, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        os.dup2(out.fileno(), 1)
-        os.dup2(err.fileno(), 2)
-        sys.stdout, sys.stderr = _STREAMS
+        stream.flush()
+        os.dup2(file.fileno(), 2)
+        sys.stderr = _STDERR
         try:
             yield lambda: text
         finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            sys.stdout, sys.stderr = streams
-            os.dup2(kept[0], 1)
-            os.dup2(kept[1], 2)
-            os.close(kept[0])
-            os.close(kept[1])
-            err.seek(0)
-            shown = [f"{each.filename}:{each.lineno}: {each.message}\n" for each in warned]
-            text = "".join(shown) + err.read().decode("utf-8", "replace")
+            _STDERR.flush()
+            sys.stderr = stream
+            os.dup2(kept, 2)
+            os.close(kept)
+            for each in warned:
+                text += f"{each.filename}:{each.lineno}: {each.message}\n"
+            file.seek(0)
+            text += file.read().decode("utf-8", "replace")
 
 
 def _begin_memory() -> float:
@@ -250,10 +237,6 @@ def _begin_memory() -> float:
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
     return _memory("VmRSS:")
-
-
-def _peak_memory() -> float:
-    return _memory("VmHWM:")
 
 
 def _memory(key: str) -> float:

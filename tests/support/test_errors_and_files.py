@@ -16,7 +16,6 @@ from psotrack.errors import (
     OutputError,
     PsotrackError,
     SettingsError,
-    check_positive,
     errors_name,
 )
 from psotrack.support import (
@@ -28,13 +27,6 @@ from psotrack.support import (
 )
 
 # --- messages
-
-
-def test_a_message_has_four_parts():
-    error = InputError(Path("a/b.csv"), expected="8 columns", found="7", remedy="export it again")
-    assert str(error) == f"{Path('a/b.csv')}: expected 8 columns, found 7; export it again"
-    error = SettingsError("drones", expected="at least 1", found="0")
-    assert str(error) == "drones: expected at least 1, found 0"
 
 
 def test_a_message_is_one_short_line(tmp_path):
@@ -63,13 +55,6 @@ def test_errors_of_a_file_name_it_and_can_be_pickled(error, message):
     copy = pickle.loads(pickle.dumps(caught.value))
     assert (type(copy), str(copy)) == (type(error), message)
     assert isinstance(copy, PsotrackError)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_check_positive(value):
-    check_positive("fps", 1e-9)
-    with pytest.raises(SettingsError, match=r"^fps: expected a number above 0, found \S+; say it$"):
-        check_positive("fps", value, "say it")
 
 
 # --- files
@@ -112,11 +97,6 @@ def test_the_old_content_survives_a_failure(tmp_path, error, name):
     assert content_of(tmp_path) == before
 
 
-def write_nothing(path):
-    with atomic_write(path):
-        pass
-
-
 def write_text_over(path):
     with atomic_write(path) as temporary:
         temporary.write_text("a,b")
@@ -131,7 +111,6 @@ BAD = {
         "out.csv: expected a path that can be written, found No space left",
     ),
     "a file for a folder": (write_text_over, "out.csv/out", "earlier results are unchanged"),
-    "nothing is written": (write_nothing, "out.csv", "No such file"),
     # Otherwise a user who passes --force and the path of a folder would lose the folder's content.
     "a folder for a file": (write_text_over, "mine", "mine: expected the path of a file, found a folder"),
     "no digest of a file that is not there": (
@@ -149,17 +128,6 @@ def test_what_cannot_be_done_is_one_line(tmp_path, name):
     (tmp_path / "mine" / "frame.png").write_text("mine")
     fail, file, words = BAD[name]
     assert_refused(lambda: fail(tmp_path / file), words, unchanged=tmp_path)
-
-
-def test_a_folder_that_cannot_be_written_is_named_before_the_work(tmp_path, monkeypatch):
-    refuse_to_overwrite(tmp_path / "new" / "tracks.csv", force=False)
-    # Rights do not bind root, who may run the tests.
-    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path)
-    assert_refused(
-        lambda: refuse_to_overwrite(tmp_path / "new" / "tracks.csv", force=True),
-        "tracks.csv: expected a path in a folder that can be written",
-        unchanged=tmp_path,
-    )
 
 
 def test_a_folder_replaces_a_folder(tmp_path):

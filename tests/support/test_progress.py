@@ -54,10 +54,6 @@ def test_long_stages_have_a_line_at_least_every_five_minutes() -> None:
     assert lines[-1] == "track: 600 of 600 in 10 h 0 min"
 
 
-def test_a_stage_of_unknown_length() -> None:
-    assert lines_of([(15.0, 1)] * 4, 0) == ["track: 2, 30 s", "track: 4, 60 s", "track: 4 in 60 s"]
-
-
 @given(
     seconds=st.lists(st.floats(0, 50), min_size=1, max_size=60),
     long_s=st.sampled_from([0.0, 20.0]),
