@@ -110,11 +110,12 @@ def test_a_board_is_drawn_in_its_true_size(tmp_path):
 
 
 def test_a_charuco_board_follows_from_images_and_the_side_of_a_square():
-    white_on_black = [255 - image for image in drawn(3)]
-    found = detect_board(0.04, white_on_black)
-    assert found.squares_wh == HELD.squares_wh
-    assert found.marker_m == pytest.approx(HELD.marker_m, rel=0.04)
-    assert found.dictionary == "4x4_50"
+    """Small markers, printed white on black."""
+    printed = Board((5, 4), 0.05, 0.027, "5x5_100")
+    found = detect_board(0.05, [255 - image for image in drawn(3, printed)])
+    assert found.squares_wh == (5, 4)
+    assert found.marker_m == pytest.approx(0.027, rel=0.04)
+    assert found.dictionary == "5x5_50"
 
 
 def test_a_chessboard_follows_from_images_and_the_side_of_a_square():

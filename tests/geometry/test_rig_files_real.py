@@ -64,34 +64,17 @@ def test_aniposes_cameras_see_the_board_in_one_place():
     np.testing.assert_allclose(pdist(position_m)[near], 0.024, rtol=0, atol=5e-4)
 
 
-def test_qualisyss_cameras_see_people_in_one_place():
+def test_qualisyss_cameras_hang_above_people():
     folder = published("perfanalytics/pose2sim") / "Pose2Sim/Demo_MultiPerson"
     rig = read_rig(folder / "calibration/Calib.qca.txt")
     assert rig.names == ("cam01", "cam02", "cam03", "cam04")
     assert rig.cameras.image_size_wh.tolist() == [[1088, 1920]] * 4
-    assert ((rig.cameras.centre_world[:, 2] > 1.5) & (rig.cameras.centre_world[:, 2] < 2.5)).all()
-    reduction = 4
-    axes = [np.arange(-2, 2, 0.05), np.arange(-2, 2, 0.05), np.arange(0.1, 2.0, 0.05)]
-    grid_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    inside = np.ones(len(grid_m), bool)
-    for index, name in enumerate(rig.names):
-        moving = moving_pixels(folder / f"videos/{name}.mp4", reduction)
-        pixels, depth_m = project(rig.cameras[index], grid_m)
-        column, row = np.floor(pixels / reduction).astype(int).T
-        inside &= (depth_m > 0) & (column >= 0) & (row >= 0) & (column < 272) & (row < 480)
-        inside[inside] = moving[row[inside], column[inside]]
-    # The voxels of a person that all cameras see moving; upside down, five voxels meet by chance.
-    assert inside.sum() > 40
-
-
-def moving_pixels(path, reduction):
-    """Pixels of the middle frame that differ from the median of the video."""
-    video = cv2.VideoCapture(str(path))
-    frames = []
-    while (frame := video.read()[1]) is not None:
-        frames.append(cv2.resize(frame, None, fx=1 / reduction, fy=1 / reduction))
-    frames = np.stack(frames[::4])
-    return (np.abs(frames[12].astype(int) - np.median(frames, axis=0)).max(axis=-1)) > 40
+    height_m = rig.cameras.centre_world[:, 2]
+    assert ((height_m > 1.5) & (height_m < 2.5)).all()
+    # All cameras see the middle of a person.
+    pixels, depth_m = project(rig.cameras, np.array([[0.0, 0.0, 1.0]]))
+    assert (depth_m > 0).all()
+    assert ((pixels > 0) & (pixels < (1088, 1920))).all()
 
 
 def test_lenses_by_name_in_json():
