@@ -10,8 +10,7 @@ from motion_textbook import simulate_flight
 
 from psotrack.pipeline import causal_settings
 from psotrack.settings import TrackSettings
-from psotrack.tracking.identity import resolve
-from psotrack.tracking.motion import estimate_jerk_density, smooth
+from psotrack.tracking.motion import smooth
 from psotrack.tracking.swarm import tracker_settings
 
 
@@ -28,10 +27,6 @@ def measured(function: Callable, array: str, index: object, value: object) -> Ca
         return function(flown.measurements, flown.params)
 
     return call
-
-
-def relabel(measurements: object, params: object) -> object:
-    return resolve(measurements, params, 0.6)
 
 
 def kernel(**options: object) -> Callable[[], object]:
@@ -51,15 +46,10 @@ BAD = {
     "kernel, joint swarm": (kernel(swarm="joint"), KERNEL + "swarm.kind joint"),
     "kernel, hard score": (kernel(score="hard"), KERNEL + "another score"),
     "time that steps back": (measured(smooth, "time_s", 3, 0.01), TIMES),
-    "endless time": (measured(estimate_jerk_density, "time_s", 29, np.inf), TIMES),
     "no position": (measured(smooth, "measured_m", (4, 1, 2), np.nan), "row 4, drone 1: " + POSITION),
     "negative variance": (
         measured(smooth, "covariance_m2", (5, 0), np.diag([1, 1, -1])),
         "measurements, row 5, drone 0: " + POSITION,
-    ),
-    "no position of tracks": (
-        measured(relabel, "measured_m", (7, 1, 2), np.nan),
-        "row 7, drone 1: " + POSITION,
     ),
 }
 
