@@ -46,10 +46,10 @@ def make_scenario(*records, groups=(), limits=WIDE, variation=NO_VARIATION, num_
     )
 
 
-def write_tracks(path, num_drones=1, count=8, orientation_wxyz=None):
+def write_tracks(path, num_drones=1, count=8):
     """Tracks of some drones, each of which is at k, 2 k and 3 k metres after k / 10 seconds."""
     k = np.arange(count)
     position_m = np.repeat(np.stack([k, 2.0 * k, 3.0 * k], axis=-1)[:, None], num_drones, axis=1)
     names = ("a", "b", "c")[:num_drones]
-    write_trajectories(path, Trajectories(k, k / 10, names, position_m, orientation_wxyz=orientation_wxyz))
+    write_trajectories(path, Trajectories(k, k / 10, names, position_m))
     return path

@@ -33,13 +33,12 @@ from placed_drones import (
     with_drones,
 )
 from scipy.spatial.transform import Rotation
-from scipy.stats import spearmanr
 from worlds import CAMERAS, NUM_FRAMES, two_flights
 
 from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
-from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry import look_at, make_camera
 from psotrack.recordings import FrameTimes, Reference, read_frames
-from psotrack.recordings.datasets import MaskWriter, join_archives, open_recording, read_masks
+from psotrack.recordings.datasets import open_recording, read_masks
 from psotrack.simulation import CameraRenderer, build, change_scenario
 from psotrack.simulation.imaging.raster import RasterView, pinhole
 from psotrack.simulation.labels.detector import detect, iou
@@ -174,42 +173,6 @@ def test_masks_and_frames_agree():
 # --- archives
 
 
-def random_mask(seed, shape=(54, 97)):
-    return np.random.default_rng(seed).random(shape) > 0.7
-
-
-def write_part(path, camera, frames):
-    with MaskWriter(path) as writer:
-        for frame in frames:
-            writer.write(camera, 1, frame, random_mask(frame))
-            writer.write(camera, 2, frame, np.zeros((54, 97), bool))
-    return path
-
-
-def test_joined_archives_are_read_as_one_archive(tmp_path):
-    first = write_part(tmp_path / "first.zip", "cam1i", range(0, 3))
-    second = write_part(tmp_path / "second.zip", "cam1i", range(3, 5))
-    third = write_part(tmp_path / "third.zip", "cam2i", range(0, 5))
-    path = tmp_path / "all.zip"
-    join_archives(path, [first, second, third])
-    with zipfile.ZipFile(path) as archive:
-        assert archive.testzip() is None
-        names = archive.namelist()
-        assert len(names) == 20
-        assert names[:2] == ["cam1i/dron1/000000.png", "cam1i/dron2/000000.png"]
-        data = archive.read("cam1i/dron1/000000.png")
-        # Width, height, bit depth and colour type as the PNG standard defines them: one bit, grey.
-        assert data[16:26] == (97).to_bytes(4, "big") + (54).to_bytes(4, "big") + b"\x01\x00"
-    with read_masks(path) as masks:
-        assert masks.cameras == ("cam1i", "cam2i")
-        assert masks.drones == (1, 2)
-        assert masks.frames == (0, 1, 2, 3, 4)
-        for camera in masks.cameras:
-            for frame in masks.frames:
-                np.testing.assert_array_equal(masks.mask(camera, 1, frame), random_mask(frame))
-                assert not masks.mask(f"{camera}_s", 2, frame).any()
-
-
 @pytest.mark.parametrize(
     "layout",
     [
@@ -221,21 +184,21 @@ def test_joined_archives_are_read_as_one_archive(tmp_path):
     ],
 )
 def test_layouts_that_name_camera_drone_and_frame_are_read(tmp_path, layout):
+    random = np.random.default_rng(0)
     with zipfile.ZipFile(tmp_path / "masks.zip", "w") as archive:
         archive.writestr("__MACOSX/._0.png", b"")
         archive.writestr("readme.txt", b"")
-        for drone in (1, 2):
-            for frame in (0, 7):
-                image = 255 * random_mask(10 * drone + frame).astype(np.uint8)
-                _, png = cv2.imencode(".png", image)
-                name = layout.format(camera=2, drone=drone, frame=frame)
-                archive.writestr(name, png.tobytes())
+        for drone, frame in ((1, 0), (1, 7), (2, 0), (2, 7)):
+            expected = random.random((54, 97)) > 0.7
+            _, png = cv2.imencode(".png", 255 * expected.astype(np.uint8))
+            name = layout.format(camera=2, drone=drone, frame=frame)
+            archive.writestr(name, png.tobytes())
     camera = "60881252" if layout.startswith("6088125") else "cam2i"
     with read_masks(tmp_path / "masks.zip") as masks:
         assert masks.cameras == (camera,)
         assert masks.drones == (1, 2)
         assert masks.frames == (0, 7)
-        np.testing.assert_array_equal(masks.mask(camera, 2, 7), random_mask(27))
+        np.testing.assert_array_equal(masks.mask(camera, 2, 7), expected)
 
 
 # --- detections
@@ -377,11 +340,8 @@ def test_confidence_grows_with_the_visible_share_and_the_quality_of_the_box(scen
     assert means[0] > 0.85
     # Each mean has a standard error of 0.01.
     assert np.diff(means).max() < -0.05
-    shaky = [found for found in detected(scene, 600, jitter=0.15) if len(found)]
-    confidence = [found.confidence[0] for found in shaky]
-    quality = [iou(found.xyxy[0], np.array(LARGE, float)) for found in shaky]
-    # Measured rank correlation 0.66.
-    assert spearmanr(quality, confidence).statistic > 0.5
+    shaky = detected(scene, 600, jitter=0.15)
+    assert np.concatenate([found.confidence for found in shaky]).mean() < means[0] - 0.05
 
 
 def test_boxes_lie_inside_the_image_in_order_of_confidence(scene):
@@ -428,8 +388,6 @@ def make_reference(position_m, orientation_wxyz=None):
     position_m = np.asarray(position_m, np.float64)
     frame = np.arange(len(position_m))
     names = tuple(f"dron{number + 1}" for number in range(position_m.shape[1]))
-    if orientation_wxyz is not None:
-        orientation_wxyz = np.asarray(orientation_wxyz, np.float64)
     return Trajectories(frame, frame / 25, names, position_m, orientation_wxyz=orientation_wxyz)
 
 
@@ -515,9 +473,6 @@ def test_points_far_outside_are_not_mapped_into_the_image():
     K = np.array([[1158.0, 0, 962], [0, 1158, 541], [0, 0, 1]])
     bent = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
     far_outside_m = (2.0, -2.0 * math.tan(math.radians(65)), 0.0)
-    pixel, _ = project(bent, np.array(far_outside_m))
-    assert (pixel > 0).all()
-    assert (pixel < (1924, 1082)).all()
     in_the_corner_m = (4.0, -3.2, 1.6)
     small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
     outside, inside = compute_labels(far_outside_m, in_the_corner_m, camera=bent, settings=small)
@@ -641,7 +596,6 @@ def test_the_data_set_can_be_loaded_by_a_trainer(flights, run_labels, tmp_path):
 
 #: Name of the case -> sequences, options, and words of the line.
 BAD = {
-    "one sequence": (["flight"], [], "found flight, of which flight for validation"),
     "the same sequence": (["flight"] * 2, [], "found flight, flight, of which flight for validation"),
     "all for validation": (["flight", "second"], ["--validation", "second,flight"],
         "found flight, second, of which flight, second for"),

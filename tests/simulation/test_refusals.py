@@ -161,8 +161,6 @@ _PLY = (
 )
 _TRIANGLE = "v 0 0 0\nv 0.3 0 0\nv 0 0.3 0\n"
 _IN_HALL = "in the hall, x within 5 m of 0, y within 4 m, z from 0 to 4 m, found ["
-_HALF_TURNED = np.tile([1.0, 0, 0, 0], (8, 1, 1))
-_HALF_TURNED[5] = np.nan
 
 #: Name of the case -> how the bad input is made, and words of the line.
 BAD = {
@@ -173,7 +171,6 @@ BAD = {
         "num_frames: expected a whole number of at most 1000000, found 2500000000"),
     "a name that is a path": (scene(name="../up"),
         "name: expected a name of letters, digits, dots, dashes and underscores", 'found "../up"'),
-    "no preset": (lambda folder, run: lambda: scenario("S99"), "scenario: expected one of S01_D2_A, ", "found S99"),
     # Changed fields.
     "a drone that is not there": (scene(**{"drones[4].yaw_deg": 0}),
         "drones[4].yaw_deg: expected a field of the scenario, found none"),
@@ -181,7 +178,6 @@ BAD = {
     "no hall": (scene(hall="lab"), "scenario S02_D4_A: hall: expected one of laboratory, large_hall, found lab"),
     "no rig": (scene(cameras="rig"),
         "cameras: expected one of laboratory, laboratory_corners, large_hall, or a list, found rig"),
-    "a rig of a larger hall": (scene(cameras="large_hall"), f"cameras: expected a place {_IN_HALL}"),
     "no model": (scene(**{"drones[0].model": "quad"}),
         "drones[0].model: expected one of x_frame, x_frame_racer, camera_drone, hexacopter, tall_cross, or a mesh, "
         "found quad"),
@@ -205,16 +201,10 @@ BAD = {
         "onboard.fov_deg: expected angles that fit 1920 x 1080 square pixels, 90 and 58.72, found [90.0, 90.0]"),
     "an exposure longer than a frame": (scene(imaging__shutter_s=0.05),
         "imaging.shutter_s: expected at most 0.04 s, the time between two frames, found 0.05"),
-    "exposures in the wrong order": (scene(imaging__exposure=[1.2, 0.8]),
-        "imaging.exposure: expected the smaller factor first"),
     "a slow shutter": (scene(onboard__line_time_s=1e-3),
         "onboard.line_time_s: expected at most 3.7e-05 s: 1080 rows in 0.04 s"),
     "three coefficients": (scene(cameras=[CAMERA | {"distortion": (0.1, 0.2, 0.3)}]),
         "cameras[0].distortion: expected 0, 4, 5, 8, 12, 14 coefficients, found 3"),
-    "five coefficients of a fisheye": (scene(cameras=[CAMERA | {"distortion": (0.1,) * 5, "fisheye": True}]),
-        "expected 0, 4 coefficients of a fisheye, found 5"),
-    "no mesh": (scene(**{"drones[0].model": {"file": "none.obj"}}),
-        "none.obj: expected a mesh file, found No such file"),
     "no recorded flight": (scene(**{"drones[0].flight": {"kind": "recording", "file": "none.csv"}}),
         "none.csv: expected a file or folder of tracks, found no such"),
     # Flights.
@@ -224,8 +214,6 @@ BAD = {
         "drones[2].flight.other: expected relative flights without a cycle, found drones 1 -> 2 -> 3 -> 1"),
     "a side that is not perpendicular": (flights(ORBIT, replace(NEAR, side=(1.0, 0.0, 1.0))),
         "flight.side: expected a direction perpendicular to swing_m, found one at 45 degrees to it; "),
-    "no side": (flights(ORBIT, replace(NEAR, side=(0.0, 0.0, 0.0))),
-        "drones[1].flight.side: expected a direction, found [0, 0, 0]"),
     "the first point again": (flights(replace(POINTS, points_m=(*POINTS.points_m, (0.0, 0.0, 1.0)))),
         "drones[0].flight.points_m[0]: expected a point that differs", "found [0.0, 0.0, 1.0] again; "),
     # Limits, with value and time.
@@ -264,13 +252,10 @@ BAD = {
     "the flights of two drones": (tracks(num_drones=2),
         "loop.csv: expected the flight of one drone, found a, b; keep one drone's rows"),
     "five positions": (tracks(count=5), "loop.csv: expected at least 6 positions, found 5"),
-    "orientations with a gap": (tracks(orientation_wxyz=_HALF_TURNED),
-        "loop.csv: expected an orientation with each position, or no orientations, found none at 0.5 s"),
     # Meshes.
     "another suffix": (mesh("solid", "a.stl"), "a.stl: expected a mesh, .obj or .ply, found .stl; export"),
     "an empty PLY file": (mesh("", "a.ply"), "a.ply: expected a mesh, found a file that cannot be read", "; export"),
     "corners without faces": (mesh(_TRIANGLE), "expected faces with an area, found no faces; export a surface"),
-    "faces without area": (mesh(_TRIANGLE + "f 1 2 2\nf 3 3 3\n"), "faces with an area, found 2 without; export"),
     "no number": (mesh("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n"), "expected numbers as vertices, found NaN"),
     "vertex 7 of 3": (mesh(_PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "a.ply"),
         "expected faces of its 3 vertices, found vertex 7"),
@@ -284,7 +269,6 @@ BAD = {
     # Flights by hand.
     "a start above the ceiling": (flown(Sample(0.0, Sticks()), start_m=(0.0, 0.0, 4.0)),
         "start: expected a point from (-4.6, -3.6, 0.15) to (4.6, 3.6, 3.6), found (0, 0, 4)"),
-    "a start that is no place": (flown(Sample(0.0, Sticks()), start_m=(0.0, np.nan, 1.0)), "found (0, nan, 1)"),
     "times that stand still": (flown(*(Sample(time_s, Sticks()) for time_s in (0.0, 1.0, 1.0))),
         "sticks: expected a time after 1 s, found 1 s"),
     "a flight of four samples": (flown(Sample(0.0, Sticks(1.0)), Sample(0.13, Sticks())),
@@ -292,8 +276,6 @@ BAD = {
     "a stick beyond its end": (sticks("-0.5", "-1.5"),
         "s.csv, line 2, column left: expected a number from -1 to 1, found -1.5"),
     "times that go back": (sticks("2.5", "0.2"), "line 4, column time_s: expected a time above 0.333333, found 0.2"),
-    "a time before the start": (sticks("0.0,1.0", "-1,1.0"),
-        "line 2, column time_s: expected a time of 0 or more, found -1"),
     "an unknown device": (lambda folder, run: lambda: open_device("joystick", LABORATORY).__enter__(),
         "device: expected gamepad, keyboard, or a file ", "found joystick"),
     # Archives of masks.
@@ -301,12 +283,8 @@ BAD = {
     "one frame twice": (masks("cam1i/dron1/1.png", "cam1i/dron1/01.png"),
         "one image per camera", "found cam1i/dron1/1.png and "),
     "no image": (masks("cam1i/dron1/0.png", drone=1), "cam1i/dron1/0.png: expected an image, found a file that"),
-    "no such drone": (masks("cam1i/dron1/0.png", drone=3), "expected a mask of dron3 in frame 0 of cam1, found none"),
     # Sequences.
-    "frames beyond the flight": (simulated(num_frames=251), "frames: expected 1 to 250", "found 251"),
     "tiny images": (simulated(scale=0.01), "scale: expected images of at least 32 pixels a side, found 20 x 10"),
-    "huge images": (simulated(scale=5.0),
-        "scale: expected images of at most 8190 pixels a side, found 9600 x 5400"),
     "a negative seed": (simulated(seed=-1), "seed: expected 0 or more, found -1"),
     "no jobs": (simulated(jobs=0), "jobs: expected 1 or more, found 0"),
     "a laboratory's recording elsewhere": (lambda folder, run: lambda: simulate_own_cameras(
@@ -316,7 +294,6 @@ BAD = {
         "simulate: expected the NAME of a scenario or --scenario FILE.toml, found neither"),
     "a change without a value": (command("S01_D2_A", "--out", "x", "--set", "imaging"),
         "--set: expected FIELD=VALUE"),
-    "a file to show": (command("--scenario", "missing.toml", "--show"), "--show: expected the NAME of a scenario"),
     "changes of what is shown": (command("S01_D2_A", "--show", "--set", "fps=50"),
         "whose file is shown as it is, found fps=50"),
     "an output of another kind": (command("fly", "--device", "script.csv", "--out", "loop"),

@@ -1,6 +1,6 @@
 """What fixed and on-board cameras show, lenses and rolling shutters included.
 
-The oracles are projections by OpenCV, plane equations, rays, and a depth buffer.
+The oracles are projections by OpenCV and a depth buffer.
 """
 
 from dataclasses import replace
@@ -165,6 +165,8 @@ def test_small_drones_are_drawn_where_opencv_projects_them(name):
     scene = with_drones(scene, *(hovering(cube(0.06), place_m) for place_m in places_m))
     renderer = CameraRenderer(scene, 0)
     views = renderer.views
+    if name == "fisheye":
+        assert (renderer.lens.face >= 0).all(), "the picture has no holes"
     empty = renderer.lens.assemble([sensor.develop(view.backdrop.light) for view in views])
     share = hidden_share(renderer.clean_frame(0), empty)
     depths_m = [view.backdrop.depth_m for view in views]
@@ -181,30 +183,6 @@ def test_small_drones_are_drawn_where_opencv_projects_them(name):
         assert silhouette.seen_share > 0.9
 
 
-def test_a_wide_lens_shows_the_whole_room_without_seams_or_holes():
-    """The picture of a fisheye, undistorted by OpenCV, is the picture of a camera without distortion."""
-    wide = with_lens("fisheye")
-    lens = wide.rig.cameras[0]
-    renderer = CameraRenderer(wide, 0)
-    assert len(renderer.views) > 1
-    assert (renderer.lens.face >= 0).all()
-    K = np.array([[120.0, 0.0, 239.5], [0.0, 120.0, 134.5], [0.0, 0.0, 1.0]])
-    no_skew = lens.K.copy()
-    no_skew[0, 1] = 0.0
-    x, y = cv2.fisheye.initUndistortRectifyMap(no_skew, lens.dist, np.eye(3), K, SIZE_WH, cv2.CV_32FC1)
-    # OpenCV's maps have no skew: a row of the image is shifted by the skew.
-    x += lens.K[0, 1] * (y - lens.K[1, 2]) / lens.K[1, 1]
-    found = cv2.remap(renderer.clean_frame(0), x, y, cv2.INTER_LINEAR)
-    inside = (x > 1) & (x < SIZE_WH[0] - 2) & (y > 1) & (y < SIZE_WH[1] - 2)
-    assert inside.mean() > 0.8
-    T = lens.T_cam_world
-    flat = make_camera(R=T[:3, :3], t_m=T[:3, 3], K=K, image_size_wh=SIZE_WH)
-    expected = CameraRenderer(replace(wide, rig=make_rig({"cam1": flat})), 0).clean_frame(0)
-    blurred = [cv2.GaussianBlur(image.mean(axis=-1), (0, 0), 1.5) for image in (found, expected)]
-    difference = np.abs(blurred[0] - blurred[1])
-    assert difference[inside].mean() < 3
-
-
 def test_a_simulated_sequence_of_any_lenses_is_a_recording(tmp_path):
     """The dataset's tables cannot hold these lenses; the recording has them, and a file has those of the drones."""
     fisheye = {"position_m": (3.0, -2.5, 2.6), "distortion": (-0.01, 0.02, 0.0, 0.0), "fisheye": True}
@@ -214,14 +192,13 @@ def test_a_simulated_sequence_of_any_lenses_is_a_recording(tmp_path):
     onboard = {"image_size_wh": ONBOARD_WH, "fov_deg": FOV_DEG, "distortion": (-0.1, 0.03, 0.0, 0.0)}
     recipe = change_scenario(S02, {"cameras": [fisheye, prism], "onboard": onboard})
     folder = simulate(recipe, tmp_path, SimulationSettings(num_frames=2, scale=0.1, masks=False), jobs=1)
-    recording = open_recording(folder)
-    found, expected = recording.rig, build(recipe, scale=0.1).rig
+    found = open_recording(folder).rig
+    expected = build(recipe, scale=0.1).rig
     assert found.names == expected.names == ("cam1", "cam2")
     assert found.cameras.fisheye.tolist() == [True, False]
     points_m = np.random.default_rng(0).uniform((-1, -1, 0.5), (1, 1, 2), (9, 3))
     shown, true = project_points(found, points_m), project_points(expected, points_m)
     np.testing.assert_allclose(shown, true, atol=1e-6)
-    assert set(recording.videos) == set(recording.detections) == {"cam1", "cam2"}
     lenses = folder / "drone_cameras.toml"
     on_drone = choose_lens((64, 36), path=lenses, fov_deg=None, name="dron1", scale=False)
     np.testing.assert_allclose(on_drone.dist[:4], onboard["distortion"])
@@ -409,25 +386,6 @@ def test_drones_cast_shadows_on_the_visible_floor(scene):
 
 
 # --- on board: motion blur, rolling shutter, exposure, noise
-
-
-def test_a_turning_camera_blurs_along_rows_by_its_rotation():
-    """A box blur of length L adds L^2 / 12 to the variance of the silhouette, along the blur only."""
-    shutter_s, speed_rad_s = 1 / 50, -3.0
-    variances = []
-    for speed in (0.0, speed_rad_s):
-        flight = turning_flight(MIDDLE, speed)
-        target = tilted_cube(0.2, (1.0, 0.3, 1.5))
-        share = hidden(flight, target, shutter_s=shutter_s, position_m=(0.0, 0.0, 0.0))
-        _, variance = mean_and_variance(share)
-        variances.append(variance)
-    along, across = variances[1] - variances[0]
-    K, _ = intrinsics(laboratory())
-    length_px = abs(speed_rad_s) * shutter_s * K[0, 0]
-    # N samples of a uniform motion have the variance L^2 / 12 (1 - 1 / N^2): with 5 samples 4 % less. With 4 samples
-    # per pixel, the silhouette's own variance of 70 px^2 has an error of a few tenths (measured 0.2).
-    assert along == pytest.approx(length_px**2 / 12, rel=0.1, abs=0.4)
-    assert abs(across) < 0.4
 
 
 def made(scale=0.5, **onboard):
