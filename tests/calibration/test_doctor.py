@@ -365,7 +365,7 @@ def test_the_command(run_psotrack, tmp_path):
     assert "nothing disagrees" in done.out
     found = pt.doctor(folder)
     assert repr(found) == "Diagnosis(nothing disagrees)"
-    assert "detections/frame" in found._repr_html_()
+    assert "cam5" in found._repr_html_()
 
     wrong, *_ = FAULTS["centres"]
     folder = record_detections(tmp_path / "with_centres", INDOORS.seen, wrong)
