@@ -11,10 +11,12 @@ import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pytest
+from dpjait_folders import UPRIGHT
 from helpers import LENSES, assert_refused, cameras_of, ring_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from worlds import IMAGE_SIZE_WH, NUM_FRAMES, RATE_HZ, make_tracks, make_tracks_file, two_flights
 
 from psotrack.evaluation import evaluate
-from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry import make_camera, project
 from psotrack.recordings import FrameTimes, Recording, Reference, probe, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.recordings.exchange import FORMATS, Footage, export_tracks, read_tracks
@@ -83,18 +85,13 @@ def tracks_file(tmp_path):
 @pytest.fixture(scope="module")
 def footage():
     """Three cameras that differ in rate and start, the last with a rolling shutter, and where the drones are."""
-    recording = Recording(
-        "clocks",
-        Path("clocks"),
-        cameras_of(
-            ring_rig(3, coefficients=5, image_size_wh=IMAGE_SIZE_WH),
-            times={
-                name: FrameTimes(int((LASTS_S - begins_s) * fps), fps, begins_s)
-                for name, (fps, begins_s, _) in CLOCKS.items()
-            },
-            line_time_s={name: line_time_s for name, (_, _, line_time_s) in CLOCKS.items()},
-        ),
-    )
+    rig = ring_rig(3, coefficients=5, image_size_wh=IMAGE_SIZE_WH)
+    times, line_times_s = {}, {}
+    for name, (fps, begins_s, line_time_s) in CLOCKS.items():
+        num_frames = int((LASTS_S - begins_s) * fps)
+        times[name] = FrameTimes(num_frames, fps, begins_s)
+        line_times_s[name] = line_time_s
+    recording = Recording("clocks", Path("clocks"), cameras_of(rig, times=times, line_time_s=line_times_s))
     time_s = recording.timeline().time_s
     position_m = np.stack([path_m(0, time_s), path_m(1, time_s)], axis=1)
     truth = Trajectories(np.arange(len(time_s)), time_s, ("0", "1"), position_m)
@@ -103,8 +100,8 @@ def footage():
 
 def instants(num_frames, fps=25.0):
     """A recording that has nothing but instants."""
-    rig = ring_rig(1)
-    return Recording("any", Path("any"), cameras_of(rig, times={rig.names[0]: FrameTimes(num_frames, fps)}))
+    times = {"c0": FrameTimes(num_frames, fps)}
+    return Recording("any", Path("any"), cameras_of(ring_rig(1), times=times))
 
 
 # There and back
@@ -140,35 +137,36 @@ def test_positions_and_gaps_come_back(to, arguments, tmp_path_factory):
     assert read.seen.sum() == written.seen.sum(), "no position between the written ones"
     np.testing.assert_allclose(read.time_s, read.frame / 25.0, rtol=0, atol=1e-12)
     # C3D has float32 millimetres: half of 2^-23 times 64 m is 3.8 micrometres. The other formats have all digits.
-    np.testing.assert_allclose(
-        read.at_frames(written.frame).position_m, written.position_m, rtol=0, atol=4e-6 if to == "c3d" else 0
-    )
+    atol = 4e-6 if to == "c3d" else 0
+    read_m = read.at_frames(written.frame).position_m
+    np.testing.assert_allclose(read_m, written.position_m, rtol=0, atol=atol)
 
 
-def test_what_each_format_keeps(tmp_path):
-    tracks = small_tracks()
-    read = {}
-    for to, name in OUTPUTS.items():
-        export_tracks(tracks, to, tmp_path / name)
-        read[to] = read_tracks(tmp_path / name, recording=instants(NUM_FRAMES))
-    assert set(OUTPUTS) == set(FORMATS)
-    seen, unknown = tracks.seen, replace(tracks, orientation_wxyz=None)
-    for to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
+@pytest.mark.parametrize("to", OUTPUTS)
+def test_what_each_format_keeps(tmp_path, to):
+    tracks, out = small_tracks(), tmp_path / OUTPUTS[to]
+    export_tracks(tracks, to, out)
+    read = read_tracks(out, recording=instants(NUM_FRAMES))
+    seen = tracks.seen
+    if to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
         # A quaternion that was a matrix in between has an error of a few roundings.
-        np.testing.assert_allclose(
-            read[to].at_frames(tracks.frame).orientation_wxyz[seen], tracks.orientation_wxyz[seen], atol=1e-14
-        )
-        export_tracks(unknown, to, tmp_path / OUTPUTS[to], force=True)
-        assert read_tracks(tmp_path / OUTPUTS[to], recording=instants(NUM_FRAMES)).orientation_wxyz is None
-    for to in ("mcap", "csv", "parquet", "json"):
-        np.testing.assert_array_equal(read[to].covariance_m2[seen], tracks.covariance_m2[seen])
-    for to in ("csv", "parquet", "json"):
-        np.testing.assert_array_equal(read[to].status, tracks.status)
-        np.testing.assert_array_equal(read[to].velocity_m_s, tracks.velocity_m_s)
-    # The folder of a bag is read, too.
+        turns = read.at_frames(tracks.frame).orientation_wxyz
+        np.testing.assert_allclose(turns[seen], tracks.orientation_wxyz[seen], atol=1e-14)
+        export_tracks(replace(tracks, orientation_wxyz=None), to, out, force=True)
+        assert read_tracks(out, recording=instants(NUM_FRAMES)).orientation_wxyz is None
+    if to in ("mcap", "csv", "parquet", "json"):
+        np.testing.assert_array_equal(read.covariance_m2[seen], tracks.covariance_m2[seen])
+    if to in ("csv", "parquet", "json"):
+        np.testing.assert_array_equal(read.status, tracks.status)
+        np.testing.assert_array_equal(read.velocity_m_s, tracks.velocity_m_s)
+
+
+def test_every_format_is_tested_and_the_folder_of_a_bag_is_read(tmp_path):
+    assert set(OUTPUTS) == set(FORMATS)
+    tracks = small_tracks()
+    export_tracks(tracks, "mcap", tmp_path / "bag_0.mcap")
     (tmp_path / "metadata.yaml").touch()
-    (tmp_path / "tracks.mcap").rename(tmp_path / "bag_0.mcap")
-    np.testing.assert_array_equal(read_tracks(tmp_path, recording=instants(NUM_FRAMES)).seen, seen)
+    np.testing.assert_array_equal(read_tracks(tmp_path, recording=instants(NUM_FRAMES)).seen, tracks.seen)
 
 
 @pytest.mark.parametrize("to", ["mot", "mcap"])
@@ -176,9 +174,8 @@ def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tracks_file
     """The same figures, except those of covariances that the format does not hold."""
     out = tmp_path / ("mot" if to == "mot" else "tracks.mcap")
     assert run_psotrack("export", tracks_file, flight, "--to", to, "--out", out).code == 0
-    expected, found = (
-        json.loads(run_psotrack("evaluate", path, flight, "--json", "-").out) for path in (tracks_file, out)
-    )
+    expected = json.loads(run_psotrack("evaluate", tracks_file, flight, "--json", "-").out)
+    found = json.loads(run_psotrack("evaluate", out, flight, "--json", "-").out)
     assert expected["missed_rate"] > 0.1, "the gaps count"
     del expected["per_drone"]
     for key, value in expected.items():
@@ -199,27 +196,18 @@ def test_the_times_say_another_rate_than_the_recordings(footage, tmp_path, to):
     np.testing.assert_allclose(read.time_s, read.frame / 20.0, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["one.txt", f"{'long' * 42}.tum"])
-def test_a_file_of_tum_has_any_name(tmp_path, name):
-    """TUM's own files end in .txt. The drone has the name of the file, however long."""
-    tracks = small_tracks().of_drones([0])
-    export_tracks(tracks, "tum", tmp_path / name)
-    read = read_tracks(tmp_path / name)
-    assert read.drones == (Path(name).stem,)
-    seen = tracks.seen[:, 0]
-    np.testing.assert_array_equal(read.position_m[:, 0], tracks.position_m[seen, 0])
-
-
 def test_times_between_the_instants_are_interpolated_and_gaps_stay(tmp_path):
+    """TUM's own files end in .txt. The drone has the name of the file, however long."""
+    path = tmp_path / f"{'long' * 42}.txt"
     time_s = 0.0137 + np.arange(40) / 25
-    keep = np.r_[0:15, 16:40]
-    position_m = path_m(0, time_s)[:, None]
-    own = Trajectories(np.arange(40)[keep], time_s[keep], ("drone",), position_m[keep])
-    export_tracks(own, "tum", tmp_path / "drone.tum")
-    read = read_tracks(tmp_path / "drone.tum", recording=instants(50))
     # The missing sample is between instants 15 and 16.
-    assert np.flatnonzero(~read.seen[:, 0]).tolist() == [0, 15, 16, *range(40, 50)]
+    frame = np.delete(np.arange(40), 15)
+    own = Trajectories(frame, time_s[frame], ("drone",), path_m(0, time_s[frame])[:, None])
+    export_tracks(own, "tum", path)
+    read = read_tracks(path, recording=instants(50))
+    assert read.drones == (path.stem,)
     there = read.seen[:, 0]
+    assert np.flatnonzero(~there).tolist() == [0, 15, 16, *range(40, 50)]
     # A cubic spline over 40 ms of a curve of 1.5 rad/s: 5/384 (1.5 x 0.04)^4 = 2e-7 m, more at the ends.
     np.testing.assert_allclose(read.position_m[there, 0], path_m(0, read.time_s[there]), atol=3e-6)
 
@@ -243,12 +231,12 @@ print(json.dumps({"rmse": ape.get_statistic(metrics.StatisticsType.rmse), "poses
 @pytest.mark.skipif(find_spec("evo") is None, reason="evo is not installed; see the Makefile")
 def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path):
     tracks, perfect = small_tracks(), replace(make_tracks(), status=None)
-    for to in ("tum", "kitti"):
-        export_tracks(tracks, to, tmp_path / to)
+    export_tracks(tracks, "tum", tmp_path / "tum")
+    export_tracks(tracks, "kitti", tmp_path / "kitti")
     export_tracks(perfect, "tum", tmp_path / "truth")
-    paths = [tmp_path / name for name in ("truth/0.tum", "tum/0.tum", "kitti/poses/0.txt")]
     result = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", EVO, *map(str, paths)],
+        [sys.executable, "-W", "ignore", "-c", EVO, "truth/0.tum", "tum/0.tum", "kitti/poses/0.txt"],
+        cwd=tmp_path,
         env=os.environ | {"HOME": str(tmp_path)},
         capture_output=True,
         text=True,
@@ -257,12 +245,12 @@ def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path):
     by_evo = json.loads(result.stdout.splitlines()[-1])
     seen = tracks.seen[:, 0]
     assert by_evo["poses"] == seen.sum()
-    ours = next(
-        drone for drone in evaluate(tracks, perfect).to_dict()["per_drone"] if drone["estimate"] == "0"
-    )
+    figures = evaluate(tracks, perfect).to_dict()["per_drone"]
+    ours = next(drone for drone in figures if drone["estimate"] == "0")
     assert by_evo["rmse"] == pytest.approx(ours["ate_rmse_m"], abs=1e-12)
     np.testing.assert_array_equal(by_evo["kitti"], tracks.position_m[seen, 0])
-    np.testing.assert_allclose(np.abs(by_evo["turns"]), np.abs(tracks.orientation_wxyz[seen, 0]), atol=1e-12)
+    turns = np.abs(tracks.orientation_wxyz[seen, 0])
+    np.testing.assert_allclose(np.abs(by_evo["turns"]), turns, atol=1e-12)
 
 
 def trackeval_clear(folder):
@@ -277,11 +265,11 @@ def trackeval_clear(folder):
     benchmark = {"BENCHMARK": "MOT15", "SPLIT_TO_EVAL": "train"}
     data = trackeval.datasets.MotChallenge2DBox(quiet | folders | benchmark)
     metric = trackeval.metrics.CLEAR({"PRINT_CONFIG": False})
-    raw = {name: data.get_raw_seq_data("psotrack", name) for name in data.seq_list}
-    return {
-        name: metric.eval_sequence(data.get_preprocessed_seq_data(each, "pedestrian"))
-        for name, each in raw.items()
-    }
+    results = {}
+    for name in data.seq_list:
+        raw = data.get_raw_seq_data("psotrack", name)
+        results[name] = metric.eval_sequence(data.get_preprocessed_seq_data(raw, "pedestrian"))
+    return results
 
 
 @pytest.fixture(scope="module")
@@ -307,111 +295,138 @@ def test_trackeval_reads_the_boxes_of_every_camera(boxes, footage):
 
 def test_boxes_are_around_the_drones_at_the_exposure(boxes, footage):
     """The oracle projects points of the ellipsoids' surface, at the time of the frame or of the drone's row."""
-    recording = footage.recording
+    rig = footage.recording.rig
     folder = boxes / "trackers" / "MOT15-train" / "psotrack" / "data"
     sphere = sphere_points(4000)
     for index, (name, (fps, begins_s, line_time_s)) in enumerate(CLOCKS.items()):
-        table = np.loadtxt(folder / f"{recording.name}-{name}.txt", delimiter=",")
-        # The exposure of a rolling shutter is counted from the first row.
-        for frame, drone, left, top, width, height, *_ in table[:: max(1, len(table) // 12)]:
+        table = np.loadtxt(folder / f"clocks-{name}.txt", delimiter=",")
+        for row in table[:: max(1, len(table) // 12)]:
+            frame, number, left, top, width, height = row[:6]
+            drone = int(number) - 1
+            # The exposure of a rolling shutter is counted from the first row.
             time_s = begins_s + (frame - 1) / fps + line_time_s * (top - 1 + height / 2)
-            points_m = path_m(int(drone) - 1, np.array([time_s])) + sphere * SIZES_M[int(drone) - 1] / 2
-            pixels = project(recording.rig.cameras[index], points_m)[0] + 0.5
-            low, high = pixels.min(axis=0), pixels.max(axis=0)
+            points_m = path_m(drone, np.array([time_s])) + sphere * SIZES_M[drone] / 2
+            pixels = project(rig.cameras[index], points_m)[0] + 0.5
             # 4000 points miss the outermost ones by up to 0.02 px here; boxes with distortion are exact up to the
             # square of the angular size, and float32 has a thousandth of a pixel.
-            np.testing.assert_allclose([left - 1, top - 1], low, atol=0.1)
-            np.testing.assert_allclose([left - 1 + width, top - 1 + height], high, atol=0.1)
+            np.testing.assert_allclose([left - 1, top - 1], pixels.min(axis=0), atol=0.1)
+            far_corner = [left - 1 + width, top - 1 + height]
+            np.testing.assert_allclose(far_corner, pixels.max(axis=0), atol=0.1)
 
 
 def test_a_drone_that_is_lost_has_no_box(tmp_path, footage):
     tracks = small_tracks(footage.recording.fps)
     export_tracks(tracks, "mot", tmp_path / "mot", footage=footage)
     # This camera has a frame at each instant.
-    table = np.loadtxt(next((tmp_path / "mot").glob("trackers/*/*/data/clocks-c1.txt")), delimiter=",")
+    path = tmp_path / "mot" / "trackers" / "MOT15-train" / "psotrack" / "data" / "clocks-c1.txt"
+    table = np.loadtxt(path, delimiter=",")
     assert sorted(table[:, :2].tolist()) == (np.argwhere(tracks.seen) + 1).tolist()
+
+
+class Message(NamedTuple):
+    """A message of a bag, read by rosbags."""
+
+    topic: str
+    time_ns: int
+    content: Any
 
 
 @pytest.fixture(scope="module")
 def messages(tmp_path_factory, flight):
-    """Topic, time and content of the messages in a bag of the small tracks without orientations, read by rosbags."""
+    """The messages in a bag of the small tracks without orientations."""
     from rosbags.highlevel import AnyReader
 
     path = tmp_path_factory.mktemp("bag") / "bag.mcap"
     tracks = replace(small_tracks(), orientation_wxyz=None)
     lost = export_tracks(tracks, "mcap", path, footage=Footage(open_recording(flight), images=True))
     assert lost == ("velocities", "fitness", "numbers of cameras", "status", "5 positions of lost drones")
+    found = []
     with AnyReader([path]) as bag:
-        return [
-            (each.topic, time_ns, bag.deserialize(raw, each.msgtype)) for each, time_ns, raw in bag.messages()
-        ]
+        for connection, time_ns, raw in bag.messages():
+            content = bag.deserialize(raw, connection.msgtype)
+            found.append(Message(connection.topic, time_ns, content))
+    return found
 
 
-def transforms_in(messages):
-    return [each for topic, _, content in messages if topic == "/tf" for each in content.transforms]
+def on_topic(messages, topic):
+    return [message for message in messages if message.topic == topic]
 
 
-def test_rosbags_reads_the_messages(messages, flight):
+def transforms_to(messages, child):
+    """The transforms to the frame of a drone or a camera."""
+    found = []
+    for message in on_topic(messages, "/tf"):
+        found += [each for each in message.content.transforms if each.child_frame_id == child]
+    return found
+
+
+def test_rosbags_reads_the_poses(messages):
     tracks = small_tracks()
-    poses = [(time_ns, content) for topic, time_ns, content in messages if topic == "/drone_0/pose"]
-    seen = tracks.seen[:, 0]
-    assert [time_ns for time_ns, _ in poses] == [40_000_000 * frame for frame in tracks.frame[seen]]
-    for row, (time_ns, content) in zip(np.flatnonzero(seen), poses, strict=True):
+    rows = np.flatnonzero(tracks.seen[:, 0])
+    poses = on_topic(messages, "/drone_0/pose")
+    for row, (_, time_ns, content) in zip(rows, poses, strict=True):
+        assert time_ns == 40_000_000 * tracks.frame[row]
+        stamp = content.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == time_ns
+        assert content.header.frame_id == "world"
         place = content.pose.pose.position
         assert [place.x, place.y, place.z] == tracks.position_m[row, 0].tolist()
-        assert content.header.frame_id == "world"
-        assert content.header.stamp.sec * 10**9 + content.header.stamp.nanosec == time_ns
-        covariance = np.asarray(content.pose.covariance).reshape(6, 6)
+        covariance = np.reshape(content.pose.covariance, (6, 6))
         np.testing.assert_array_equal(covariance[:3, :3], tracks.covariance_m2[row, 0])
         assert np.diag(covariance)[3:].tolist() == [1e9] * 3, "the orientation is not known"
-    children = [each.child_frame_id for each in transforms_in(messages)]
-    assert [children.count(name) for name in ("drone_0", "drone_1")] == tracks.seen.sum(axis=0).tolist()
+    assert len(transforms_to(messages, "drone_0")) == len(rows)
     # Cameras at 0 s and at the end, 0.52 s.
-    assert [children.count(name) for name in CLOCKS] == [2, 2, 2]
-    images = [content for topic, _, content in messages if topic == "/c1/image/compressed"]
+    assert len(transforms_to(messages, "c1")) == 2
+
+
+def test_rosbags_reads_the_images(messages, flight):
+    images = on_topic(messages, "/c1/image/compressed")
     assert len(images) == NUM_FRAMES
-    picture = cv2.imdecode(np.frombuffer(bytes(images[9].data), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    data = np.frombuffer(bytes(images[9].content.data), np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int)
     # JPEG of a noisy image is near it, and nearer than to the images in which the drones are elsewhere.
     off = [np.abs(picture - frame).mean() for frame in read_frames(probe(flight / "c1.avi"))]
     assert np.argmin(off) == 9
     # At 0 and with every later image.
-    assert sum(topic == "/c1/camera_info" for topic, *_ in messages) == NUM_FRAMES
+    assert len(on_topic(messages, "/c1/camera_info")) == NUM_FRAMES
 
 
 def test_a_camera_info_and_its_transform_project_as_the_camera_does(messages, flight):
     """The oracle is OpenCV, with the numbers that ROS programs get."""
-    info = next(content for topic, _, content in messages if topic == "/c2/camera_info")
-    assert (info.distortion_model, len(info.d), info.width, info.height) == ("plumb_bob", 5, *IMAGE_SIZE_WH)
-    pose = next(each for each in transforms_in(messages) if each.child_frame_id == "c2")
-    turn, place = pose.transform.rotation, pose.transform.translation
+    info = on_topic(messages, "/c2/camera_info")[0].content
+    assert (info.width, info.height) == IMAGE_SIZE_WH
+    pose = transforms_to(messages, "c2")[0].transform
+    turn, place = pose.rotation, pose.translation
     R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix().T
     t = -R @ [place.x, place.y, place.z]
-    point_m, K = np.array([[0.3, 0.2, 1.0]]), np.array(info.k).reshape(3, 3)
+    K = np.reshape(info.k, (3, 3))
+    point_m = np.array([[0.3, 0.2, 1.0]])
     expected, _ = cv2.projectPoints(point_m, cv2.Rodrigues(R)[0], t, K, np.array(info.d))
     camera = open_recording(flight).rig.cameras[2]
     np.testing.assert_allclose(project(camera, point_m)[0], expected[0], atol=1e-9)
 
 
+FISHEYE = (0.1, 0.01, -0.01, 0.001)
+
+
 @pytest.mark.parametrize(
-    ("dist", "fisheye", "model"),
+    ("model", "lens", "coefficients"),
     [
-        (LENSES[4], False, "plumb_bob"),
-        (LENSES[5], False, "plumb_bob"),
-        (LENSES[8], False, "rational_polynomial"),
-        ((0.1, 0.01, -0.01, 0.001), True, "equidistant"),
-        ((*LENSES[8], 1e-3, 0.0, 0.0, 0.0), False, None),
-        ((*LENSES[8], 0.0, 0.0, 0.0, 0.0, 0.01, 0.0), False, None),
+        ("plumb_bob", {"dist": LENSES[4]}, [*LENSES[4], 0]),
+        ("plumb_bob", {"dist": LENSES[5]}, [*LENSES[5]]),
+        ("rational_polynomial", {"dist": LENSES[8]}, [*LENSES[8]]),
+        ("equidistant", {"dist": FISHEYE, "fisheye": True}, [*FISHEYE]),
     ],
 )
-def test_the_lens_models_of_ros(dist, fisheye, model):
-    R, t_m = look_at((3.0, 0.0, 2.0), (0.0, 0.0, 1.0))
-    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=IMAGE_SIZE_WH, dist=dist, fisheye=fisheye)
-    message = camera_message({}, camera)
-    assert (None if message is None else message["distortion_model"]) == model
-    if message is not None:
-        size = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}[message["distortion_model"]]
-        assert message["d"] == [*dist, *[0.0] * size][:size]
+def test_the_lens_models_of_ros(model, lens, coefficients):
+    message = camera_message({}, make_camera(**UPRIGHT | lens))
+    assert message["distortion_model"] == model
+    assert message["d"] == coefficients
+
+
+@pytest.mark.parametrize("more", [(1e-3, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.01, 0.0)])
+def test_ros_has_no_thin_prisms_and_no_tilted_sensors(more):
+    assert camera_message({}, make_camera(**UPRIGHT | {"dist": LENSES[8] + more})) is None
 
 
 def test_the_definitions_of_the_messages_are_those_of_ros():
@@ -432,38 +447,37 @@ def test_export_says_what_is_lost(run_psotrack, tracks_file, tmp_path):
         f"{tmp_path / 'kitti'}: kitti, 2 drones, 14 frames; not in this format: covariances, velocities, fitness, "
         "numbers of cameras, status, 3 positions of lost drones\n"
     )
-    result = run_psotrack("export", tracks_file, "--to", "json", "--out", tmp_path / "again.json")
-    assert result.out == f"{tmp_path / 'again.json'}: json, 2 drones, 14 frames\n"
     late = replace(small_tracks(), time_s=small_tracks().time_s + 0.013)
     assert "times" in export_tracks(late, "c3d", tmp_path / "late.c3d")
     assert "times" not in export_tracks(late, "tum", tmp_path / "late")
 
 
 def test_inputs_are_not_replaced_even_with_force_and_images_need_mcap(run_psotrack, tracks_file, tmp_path):
-    for words, line in (
-        (["csv", "--out", tracks_file], ["found TRACKS", "another path"]),
-        (["json", "--out", tmp_path / "tracks.json"], ["record of TRACKS"]),
-        (["mcap", "--images"], ["--images", "no SEQ"]),
-        (["tum", "--images"], ["--images", "--to tum"]),
+    for words, said in (
+        (f"csv --out {tracks_file}", "found TRACKS"),
+        (f"json --out {tmp_path / 'tracks.json'}", "record of TRACKS"),
+        ("mcap --images", "no SEQ"),
+        ("tum --images", "--to tum"),
     ):
-        command = ("export", tracks_file, "--to", *words, "--force")
-        assert_refused(lambda command=command: run_psotrack(*command), *line, unchanged=tmp_path)
+        command = ("export", tracks_file, "--to", *words.split(), "--force")
+        assert_refused(lambda command=command: run_psotrack(*command), said, unchanged=tmp_path)
 
 
 def test_the_missing_extra_is_named(tmp_path, monkeypatch):
     export_tracks(small_tracks(), "mcap", tmp_path / "tracks.mcap")
     for name in ("mcap.reader", "mcap_ros2.writer"):
         monkeypatch.setitem(sys.modules, name, None)
-    for missing in (
-        lambda: export_tracks(small_tracks(), "mcap", tmp_path / "again.mcap"),
-        lambda: read_tracks(tmp_path / "tracks.mcap"),
-    ):
-        assert_refused(missing, "pip install '.[ros]'", unchanged=tmp_path)
+    remedy = "pip install '.[ros]'"
+    again = tmp_path / "again.mcap"
+    assert_refused(lambda: export_tracks(small_tracks(), "mcap", again), remedy, unchanged=tmp_path)
+    assert_refused(lambda: read_tracks(tmp_path / "tracks.mcap"), remedy, unchanged=tmp_path)
 
 
 def test_a_file_beside_the_positions_states_their_rate(tmp_path):
     (tmp_path / "seqinfo.ini").write_text("[Sequence]\nframeRate=10\n")
     (tmp_path / "mot.txt").write_text("1,12,-1,-1,-1,-1,1,1,2,3\n4,7,-1,-1,-1,-1,1,4,5,6\n")
     read = read_tracks(tmp_path / "mot.txt")
-    assert (read.drones, read.frame.tolist(), read.time_s.tolist()) == (("7", "12"), [0, 3], [0.0, 0.3])
+    assert read.drones == ("7", "12")
+    assert read.frame.tolist() == [0, 3]
+    assert read.time_s.tolist() == [0.0, 0.3]
     assert read.position_m[1, 0].tolist() == [4, 5, 6]
