@@ -1,30 +1,24 @@
 """The dataset's folders: both halves are read, written files are read back, and what is wrong is said in one line."""
 
-import csv
-
 import cv2
 import numpy as np
 import pytest
 from dpjait_folders import POSE_HEADER, REAL_HEADER, SERIALS, edit, pose_lines, write_cameras, write_video
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import make_camera, make_rig, project
 from psotrack.geometry.rig_files import read_rig, write_calibration
-from psotrack.recordings import inventory_table, read_detections
+from psotrack.recordings import read_detections
 from psotrack.recordings.datasets import (
     CALIBRATION,
-    MARKER_CORNERS,
     ONBOARD_CALIBRATION,
     pose_file,
-    read_marker_corners,
     read_onboard,
     read_onboard_calibration,
     read_poses,
     read_sequence,
-    write_marker_corners,
     write_onboard_calibration,
     write_poses,
 )
@@ -49,9 +43,8 @@ def test_the_simulated_half(simulated, monkeypatch):
     recording = read_sequence(".")
     assert recording.name == "S99_D9"
     assert recording.rig.names == ("cam1i", "cam2i", "cam3i")
-    assert {name: video.path.name for name, video in recording.videos.items()} == {
-        name: f"{name}_s.avi" for name in recording.rig.names
-    }
+    files = [video.path.name for video in recording.videos.values()]
+    assert files == ["cam1i_s.avi", "cam2i_s.avi", "cam3i_s.avi"]
     assert (recording.fps, recording.num_frames) == (25.0, 5)
     cameras = recording.rig.cameras
     assert cameras.image_size_wh.tolist() == [[64, 48]] * 3
@@ -82,8 +75,7 @@ def test_the_cameras_on_drones(simulated):
     assert np.isnan(first.position_m[0]).all(), "the first row is a placeholder"
     np.testing.assert_allclose(second.position_m[1:, 0], [1.2, 1.3, 1.4, 1.5], rtol=0, atol=1e-12)
     assert second.orientation_wxyz[4].tolist() == [0, 0, 0, 1]
-    content = recording.to_dict()
-    assert content["onboard"]["dron1"] == {
+    assert recording.to_dict()["onboard"]["dron1"] == {
         "video": str(simulated / "dron1_cam_s.avi"),
         "frames": 5,
         "fps": 25.0,
@@ -91,11 +83,6 @@ def test_the_cameras_on_drones(simulated):
         "focal_length_px": 60.5,
         "frames_with_pose": 4,
     }
-    console = Console(width=120)
-    with console.capture() as capture:
-        console.print(inventory_table(content))
-    row = next(line for line in capture.get().splitlines() if "on dron1" in line)
-    assert row.split() == ["on", "dron1", "dron1_cam_s.avi", "5", "25", "64", "x", "48", "60.5", "4", "poses"]
     # Intrinsics and poses without videos are ignored.
     for path in simulated.glob("dron?_cam_s.avi"):
         path.unlink()
@@ -119,8 +106,9 @@ def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated, 
         (simulated / "dl_data" / f"{name}.csv").write_text(f"{number},10,20,30,40,25,40,0.66,,,,,,,\n")
     (simulated / "dl_data" / f"{more}.csv").unlink()
     recording = read_sequence(simulated)
-    assert {name: video.path.stem for name, video in recording.videos.items()} == names
-    for number, name in enumerate(names):
+    assert list(recording.videos) == list(names)
+    for number, (name, stem) in enumerate(names.items()):
+        assert recording.videos[name].path.stem == stem
         assert read_detections(recording.detections[name]).frame.tolist() == [number]
 
 
@@ -144,12 +132,13 @@ def test_the_real_half(real):
 def test_projection_agrees_with_opencv(sound, half, metres):
     """Projection agrees with `cv2.projectPoints` and the values of the file: t is not the camera's centre."""
     rig = read_sequence(sound / half).rig
-    line = (sound / half / CALIBRATION).read_text().splitlines()[2].split(";")
-    t, rvec = np.array(line[1:4], float), np.array(line[4:7], float)
-    f, cx, cy = (float(value) for value in line[7:10])
-    points_m = np.random.default_rng(0).uniform(-2, 2, (7, 3))
+    text = (sound / half / CALIBRATION).read_text()
+    values = [float(value) for value in text.splitlines()[2].split(";")[1:]]
+    t, rvec, dist = np.array(values[:3]), np.array(values[3:6]), np.array(values[9:])
+    f, cx, cy = values[6:9]
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
-    expected, _ = cv2.projectPoints(points_m / metres, rvec, t, K, np.array(line[10:], float))
+    points_m = np.random.default_rng(0).uniform(-2, 2, (7, 3))
+    expected, _ = cv2.projectPoints(points_m / metres, rvec, t, K, dist)
     pixels, depth_m = project(rig.cameras[1], points_m)
     assert depth_m.min() > 0
     # Both compute in double precision with pixels up to a few thousand.
@@ -180,9 +169,10 @@ def test_videos_may_differ_in_length_and_size(simulated):
     edit(CALIBRATION, "1157.3;32;24", "1157.3;47;31")(simulated)
     recording = read_sequence(simulated)
     assert recording.num_frames == recording.truth.num_frames == 7
-    assert recording.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
-    assert recording.usable().timeline().frame[4:6].tolist() == [[4, 4, 4], [-1, 5, -1]]
-    assert recording.usable().rig.cameras.image_size_wh.tolist() == [[96, 64], [64, 48], [64, 48]]
+    assert np.flatnonzero(recording.truth.seen[:, 0]).tolist() == [1, 2, 3, 4]
+    usable = recording.usable()
+    assert usable.timeline().frame[4:6].tolist() == [[4, 4, 4], [-1, 5, -1]]
+    assert usable.rig.cameras.image_size_wh.tolist() == [[96, 64], [64, 48], [64, 48]]
 
 
 def test_poses_that_are_missing_more_than_frames_or_at_another_rate(simulated):
@@ -193,9 +183,9 @@ def test_poses_that_are_missing_more_than_frames_or_at_another_rate(simulated):
     truth = read_sequence(simulated).truth
     assert truth.drones == ("dron1", "dron2", "dron10")
     assert truth.num_frames == 5
-    assert truth.seen[:, 0].tolist() == [False, True, True, False, False]
+    assert np.flatnonzero(truth.seen[:, 0]).tolist() == [1, 2]
     # One missing row is interpolated.
-    assert truth.seen[:, 1].tolist() == [False, True, True, True, True]
+    assert np.flatnonzero(truth.seen[:, 1]).tolist() == [1, 2, 3, 4]
     assert truth.position_m[3, 1, 0] == pytest.approx(1.3, abs=0.02)
     np.testing.assert_allclose(truth.position_m[1:, 2, 0], [9.4, 9.8, 10.2, 10.6], rtol=0, atol=1e-12)
     for path in simulated.glob("dron*_pos_*.csv"):
@@ -203,22 +193,23 @@ def test_poses_that_are_missing_more_than_frames_or_at_another_rate(simulated):
     assert read_sequence(simulated).truth is None
 
 
-@pytest.mark.parametrize(
-    "change_text",
-    [
-        lambda text: "\ufeff" + text.replace("\n", "\r\n"),
-        lambda text: text.replace("\n", ";\n") + "\n\n;;;\n",
-        lambda text: text.replace(";", " ; ").replace("cam_", "CAM_"),
-    ],
-    ids=["byte order mark and Windows", "last separator and blank lines", "spaces and upper case"],
-)
+def as_windows_saves_it(text):
+    return "\ufeff" + text.replace("\n", "\r\n")
+
+
+def as_spreadsheets_save_it(text):
+    """With a last separator, blank lines, spaces and capitals."""
+    text = text.replace("\n", ";\n") + "\n\n;;;\n"
+    return text.replace(";", " ; ").replace("cam_", "CAM_")
+
+
+@pytest.mark.parametrize("change_text", [as_windows_saves_it, as_spreadsheets_save_it])
 def test_harmless_differences_are_accepted(simulated, change_text):
     original = read_sequence(simulated)
     for name in (CALIBRATION, "dron1_pos_25.csv"):
         path = simulated / name
         path.write_bytes(change_text(path.read_text()).encode())
     changed = read_sequence(simulated)
-    assert changed.rig.names == original.rig.names
     np.testing.assert_array_equal(changed.rig.cameras.T_cam_world, original.rig.cameras.T_cam_world)
     np.testing.assert_array_equal(changed.truth.position_m, original.truth.position_m)
 
@@ -229,7 +220,6 @@ def test_harmless_differences_are_accepted(simulated, change_text):
         ("quaternion.w;quaternion.x;quaternion.y;quaternion.z", [0, 0, 0, 1]),
         ("or_q_w[-];or_q_x[-];or_q_y[-];or_q_z[-]", [0, 0, 0, 1]),
         ("q_x;q_y;q_z;q_w", [1, 0, 0, 0]),
-        ("q1;q2;q3;q4", None),
     ],
 )
 def test_column_names_of_the_quaternion(tmp_path, names, expected):
@@ -238,32 +228,34 @@ def test_column_names_of_the_quaternion(tmp_path, names, expected):
     (tmp_path / "dron1_pos_25.csv").write_text(text)
     position_m, orientation_wxyz = read_poses(tmp_path / "dron1_pos_25.csv")
     assert position_m[0].tolist() == [1, 2, 3]
-    assert (None if orientation_wxyz is None else orientation_wxyz[1].tolist()) == expected
+    assert orientation_wxyz[1].tolist() == expected
 
 
 def write_bodies(path, **bodies):
-    """A recording of bodies that fly along a diagonal, (frames, markers, 3) or (markers, 3) each."""
+    """A recording of bodies that fly along a diagonal, (100 or 1, markers, 3) each."""
     t = np.arange(100)[:, None, None] / 100
-    position_m = [np.broadcast_to(body_m, (100, *np.shape(body_m)[-2:])) + t for body_m in bodies.values()]
-    labels = [f"{name}:{name[0]}{i}" for name, body_m in bodies.items() for i in range(np.shape(body_m)[-2])]
-    write_c3d(path, Markers(tuple(labels), np.concatenate(position_m, axis=1), 100.0))
+    labels = []
+    for name, body_m in bodies.items():
+        labels += [f"{name}:{name[0]}{number}" for number in range(body_m.shape[1])]
+    position_m = np.concatenate([body_m + t for body_m in bodies.values()], axis=1)
+    write_c3d(path, Markers(tuple(labels), position_m, 100.0))
 
 
-BOX_M = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]])
+BOX_M = np.array([[[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]]])
 
 
 def test_a_person_in_the_folder_is_no_reference(run_psotrack, real, tmp_path, caplog):
     """Found: `evaluate` scored tracks against a walking person without a word."""
     rng = np.random.default_rng(0)
     t = np.arange(100)[:, None, None] / 100
-    person_m = rng.uniform(-0.5, 0.5, (10, 3)) + 0.2 * np.sin(6 * t + rng.uniform(0, 6, (10, 1)))
+    swing_m = 0.2 * np.sin(6 * t + rng.uniform(0, 6, (10, 1)))
+    person_m = rng.uniform(-0.5, 0.5, (10, 3)) + swing_m
     write_bodies(real / "R99.c3d", daphnee=person_m, boite=BOX_M)
     (tmp_path / "tracks.csv").write_text("frame,drone,x_m,y_m,z_m\n0,dron1,0,0,1\n1,dron1,0,0,1\n")
     command = ("evaluate", tmp_path / "tracks.csv", real, "--quiet")
     result = run_psotrack(*command)
     assert result.code == 2
     assert "expected a reference to compare with, found none" in result.err
-    assert "boite, rigid (boite:b0, " in caplog.text
     assert "daphnee, not rigid" in caplog.text
     assert run_psotrack(*command, "--body", "cf1=b0,b1,b2,b3").code == 0
     assert read_sequence(real, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
@@ -292,8 +284,9 @@ def test_the_video_of_a_drone_alone_is_enough(simulated, missing, rows, file_nam
     assert onboard.video.path.name == file_name
     assert (onboard.K is None) == (missing == ONBOARD_CALIBRATION)
     assert onboard.position_m.shape == (5, 3)
-    assert np.isfinite(onboard.position_m).all(axis=1).sum() == num_known
-    assert np.isfinite(onboard.orientation_wxyz).all(axis=1).sum() == num_known
+    known = np.isfinite(onboard.position_m).all(axis=1)
+    assert known.sum() == num_known
+    assert np.isfinite(onboard.orientation_wxyz).all(axis=1).tolist() == known.tolist()
     assert list(read_sequence(simulated).videos) == ["cam1i", "cam2i", "cam3i"]
 
 
@@ -310,36 +303,31 @@ def test_a_sequence_is_read_without_broken_onboard_files(simulated, caplog):
 
 
 finite = st.floats(-50, 50)
-triples = st.tuples(finite, finite, finite)
+triples = st.tuples(finite, finite, finite).map(np.array)
+angle = st.floats(-4, 4)
+tiny = st.floats(-1e-9, 1e-9)
 #: All rotations, and rotations near half a turn, where the Rodrigues vector is nearly ambiguous.
-rotations = st.one_of(
-    st.tuples(*[st.floats(-4, 4)] * 3).map(Rotation.from_rotvec),
-    st.tuples(*[st.floats(-1e-9, 1e-9)] * 3).map(
-        lambda small: Rotation.from_rotvec(np.array([np.pi, 0, 0]) + small)
-    ),
-)
+near_half_a_turn = st.tuples(tiny.map(lambda small: np.pi + small), tiny, tiny)
+rotations = (st.tuples(angle, angle, angle) | near_half_a_turn).map(Rotation.from_rotvec)
 FULL_HD = (1920, 1080)
-PLAIN_K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+distortion = st.floats(-0.5, 0.5)
 
 
-def camera_at(rotation, t_m, K=PLAIN_K, dist=(), fisheye=False):
-    R, t_m = rotation.as_matrix(), np.array(t_m)
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=FULL_HD, dist=dist, fisheye=fisheye)
+def camera_at(rotation, t_m, focal=1000.0, dist=()):
+    K = np.array([[focal, 0, 960], [0, focal, 540], [0, 0, 1]])
+    return make_camera(R=rotation.as_matrix(), t_m=t_m, K=K, image_size_wh=FULL_HD, dist=dist)
 
 
 @given(
     poses=st.lists(st.tuples(rotations, triples), min_size=1, max_size=5),
-    dist=st.one_of(st.just(()), st.tuples(*[st.floats(-0.5, 0.5)] * 4)),
+    dist=st.just(()) | st.tuples(distortion, distortion, distortion, distortion),
     unit=st.sampled_from(["m", "mm"]),
 )
 def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
     path = tmp_path_factory.getbasetemp() / CALIBRATION
-    cameras = {
-        f"cam{i}i": camera_at(
-            *pose, np.array([[1156.3 + i, 0, 960.25], [0, 1156.3 + i, 540 + i], [0, 0, 1]]), dist
-        )
-        for i, pose in enumerate(poses)
-    }
+    cameras = {}
+    for index, (rotation, t_m) in enumerate(poses):
+        cameras[f"cam{index}i"] = camera_at(rotation, t_m, 1156.3 + index, dist)
     rig = make_rig(cameras)
     write_calibration(path, rig, unit)
     again = read_rig(path, FULL_HD)
@@ -353,7 +341,9 @@ def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
 
 
 def test_written_files_look_like_the_published_ones(tmp_path):
-    rig = make_rig({"cam1i": camera_at(Rotation.identity(), (1.0, 2.0, 3.0), dist=(0.1, 0.0, 0.0, 0.0))})
+    rig = make_rig(
+        {"cam1i": camera_at(Rotation.identity(), np.array([1.0, 2.0, 3.0]), dist=(0.1, 0.0, 0.0, 0.0))}
+    )
     write_calibration(tmp_path / CALIBRATION, rig, "mm")
     assert (tmp_path / CALIBRATION).read_text().splitlines() == [
         REAL_HEADER,
@@ -381,35 +371,22 @@ def test_written_poses_are_read_back(tmp_path_factory, poses):
     # The reader normalises the quaternion, which rounds it.
     assert (again * rotation[1:].inv()).magnitude().max() < 1e-12
     # The Euler angles in the file are the same rotation: R = Rz Ry Rx.
-    with path.open() as file:
-        rows = list(csv.DictReader(file, delimiter=";"))[1:]
-    angles_rad = np.array([[float(row[f"rot_{axis}[rad]"]) for axis in "xyz"] for row in rows])
-    Rx, Ry, Rz = (Rotation.from_rotvec(np.eye(3)[axis] * angles_rad[:, axis : axis + 1]) for axis in range(3))
+    angles_rad = np.loadtxt(path, delimiter=";", skiprows=2, ndmin=2)[:, 4:7]
+    by_angles = Rotation.from_euler("xyz", angles_rad)
     # Near gimbal lock, Euler angles lose half of their digits: the error is up to 1e-7 rad.
-    assert ((Rz * Ry * Rx) * rotation[1:].inv()).magnitude().max() < 1e-6
+    assert (by_angles * rotation[1:].inv()).magnitude().max() < 1e-6
 
 
-@given(
-    cameras=st.lists(
-        st.tuples(*[st.floats(1e-3, 1e5)] * 2, *[st.floats(-1e4, 1e4)] * 2, *[st.integers(1, 8000)] * 2),
-        min_size=1,
-        max_size=4,
-    ),
-    corners=st.dictionaries(
-        st.integers(0, 999), st.lists(triples, min_size=4, max_size=4).map(np.array), min_size=1, max_size=5
-    ),
-)
-def test_written_intrinsics_and_marker_corners_are_read_back(tmp_path_factory, cameras, corners):
-    folder = tmp_path_factory.getbasetemp()
-    intrinsics = {
-        f"dron{number}": (np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (width, height))
-        for number, (fx, fy, cx, cy, width, height) in enumerate(cameras, start=1)
-    }
-    write_onboard_calibration(folder / ONBOARD_CALIBRATION, intrinsics)
-    again = read_onboard_calibration(folder / ONBOARD_CALIBRATION)
-    assert list(again) == list(intrinsics)
-    for name, (expected, size_wh) in intrinsics.items():
-        np.testing.assert_array_equal(again[name][0], expected)
-        assert again[name][1] == size_wh
-    write_marker_corners(folder / MARKER_CORNERS, corners)
-    np.testing.assert_equal(dict(read_marker_corners(folder / MARKER_CORNERS)), corners)
+focals, middles, sides = st.floats(1e-3, 1e5), st.floats(-1e4, 1e4), st.integers(1, 8000)
+intrinsics = st.tuples(focals, focals, middles, middles, sides, sides)
+
+
+@given(cameras=st.lists(intrinsics, min_size=1, max_size=4))
+def test_written_intrinsics_are_read_back(tmp_path_factory, cameras):
+    path = tmp_path_factory.getbasetemp() / ONBOARD_CALIBRATION
+    written = {}
+    for number, (fx, fy, cx, cy, width, height) in enumerate(cameras, start=1):
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        written[f"dron{number}"] = (K, (width, height))
+    write_onboard_calibration(path, written)
+    np.testing.assert_equal(dict(read_onboard_calibration(path)), written)

@@ -155,14 +155,12 @@ def test_frames_by_what_the_parameters_say_and_what_is_there(
     assert ("a.c3d: its header says" in caplog.text) == (header_frames != expected)
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [{}, {"TRIAL__ACTUAL_START_FIELD": (1, 0), "TRIAL__ACTUAL_END_FIELD": (70_000 - 65536, 1)}],
-)
-def test_more_frames_than_16_bits_hold(tmp_path, caplog, changed):
+def test_more_frames_than_16_bits_hold(tmp_path, caplog):
     points = np.ones((70_000, 1, 4))
-    path = make_c3d(tmp_path / "a.c3d", points, header_frames=65535, FRAMES=65535, **changed)
-    assert len(read_c3d(path).position_m) == 70_000
+    fields = {"TRIAL__ACTUAL_START_FIELD": (1, 0), "TRIAL__ACTUAL_END_FIELD": (70_000 - 65536, 1)}
+    for changed in ({}, fields):
+        path = make_c3d(tmp_path / "a.c3d", points, header_frames=65535, FRAMES=65535, **changed)
+        assert len(read_c3d(path).position_m) == 70_000
     assert not caplog.records
 
 
@@ -196,11 +194,6 @@ def test_a_file_without_parameters_is_read_by_its_header(tmp_path, caplog):
     assert markers.labels == ("*1", "*2", "*3")
     assert markers.rate_hz == 50
     np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
-    content[530] = 1
-    path.write_bytes(content)
-    assert_refused(
-        lambda: read_c3d(path), "parameters that are damaged: none can be read", unchanged=tmp_path
-    )
 
 
 def test_analogue_samples_counted_as_channels(tmp_path):
@@ -323,7 +316,7 @@ def test_markers_on_a_line_have_a_position_but_no_rotation(num_markers):
 # --- learning the shape
 
 
-@pytest.mark.parametrize("markers_m", [FOUR_M, FIVE_M, FOUR_M[:3]], ids=["four", "five", "three"])
+@pytest.mark.parametrize("markers_m", [FOUR_M, FIVE_M], ids=["four", "five"])
 def test_the_frame_of_a_learned_cross_depends_on_its_shape_only(markers_m):
     """Two recordings of different flights give the same frame: x points to the first marker, and z up."""
     first = learn_cross(record_markers(markers_m, begin_s=1))
@@ -354,14 +347,9 @@ def test_a_cross_is_learned_despite_swapped_labels_and_unseen_markers():
 # --- identification of markers
 
 
-def test_markers_among_stray_points_and_of_a_large_body():
-    cross = learn_cross(record_markers(FIVE_M))
-    points_m = record_markers(FIVE_M, 1, begin_s=3, noise_m=NOISE_M)[0]
+def test_markers_of_a_large_body_are_found_at_once():
+    """All subsets of the right labelling of 20 markers fit too: a million, which must not be tried."""
     rng = np.random.default_rng(0)
-    strays_m = points_m[0] + rng.uniform(-1, 1, (20, 3))
-    mixed_m = np.vstack([strays_m[:7], points_m[[3, 0]], strays_m[7:], points_m[[4, 1, 2]]])
-    np.testing.assert_array_equal(identify_markers(cross, mixed_m), points_m)
-    # All subsets of the right labelling of 20 markers fit too: a million, which must not be tried.
     body_m = rng.uniform(-0.4, 0.4, (20, 3))
     body_m -= body_m.mean(axis=0)
     np.testing.assert_array_equal(identify_markers(body_m, rng.permutation(body_m)), body_m)
@@ -369,8 +357,7 @@ def test_markers_among_stray_points_and_of_a_large_body():
 
 def test_points_that_are_not_the_cross():
     cross = learn_cross(record_markers(FOUR_M))
-    for points_m in (np.zeros((0, 3)), FOUR_M[:2], FOUR_M * 1.5):
-        assert np.isnan(identify_markers(cross, points_m)).all()
+    assert np.isnan(identify_markers(cross, FOUR_M * 1.5)).all()
     # A symmetric cross fits itself in more than one way.
     assert np.isnan(identify_markers(SQUARE_M, SQUARE_M + 1.0)).all()
     # All distances of a mirror image fit, but no rotation does.
@@ -381,25 +368,6 @@ def test_points_that_are_not_the_cross():
 
 
 # --- poses over time
-
-
-def test_swapped_labels_change_no_pose():
-    markers_m = record_markers(FOUR_M, noise_m=NOISE_M)
-    cross = learn_cross(markers_m)
-    expected_m, expected_wxyz, _ = cross_poses(cross, markers_m, RATE_HZ)
-    swapped_m = markers_m.copy()
-    swapped_m[30:40] = markers_m[30:40, [1, 0, 2, 3]]
-    swapped_m[60] = markers_m[60, [3, 0, 1, 2]]
-    # In frame 70, the fourth marker is missing too.
-    swapped_m[70] = markers_m[70, [1, 0, 2, 3]]
-    swapped_m[70, 3] = np.nan
-    position_m, orientation_wxyz, bridged = cross_poses(cross, swapped_m, RATE_HZ)
-    assert not bridged.any()
-    # Without one marker with noise of 0.3 mm the centroid moves by less than a millimetre.
-    np.testing.assert_allclose(position_m[70], expected_m[70], rtol=0, atol=1e-3)
-    others = np.arange(120) != 70
-    np.testing.assert_array_equal(position_m[others], expected_m[others])
-    np.testing.assert_array_equal(orientation_wxyz[others], expected_wxyz[others])
 
 
 def test_stray_markers_are_left_out_and_frames_in_which_nothing_fits_are_gaps():
@@ -453,14 +421,6 @@ def turned_rad(orientation_wxyz, time_s):
     turn, _ = flight(time_s)
     off = turn.inv() * body
     return (off[0].inv() * off).magnitude()
-
-
-def test_a_single_pose_between_gaps():
-    markers_m = record_markers(FOUR_M, 3, rate_hz=20.0)
-    cross = learn_cross(markers_m)
-    markers_m[1] = np.nan
-    position_m, _, _ = cross_poses(cross, markers_m, 20.0)
-    np.testing.assert_allclose(position_m[1], position_m[[0, 2]].mean(axis=0), rtol=0, atol=1e-12)
 
 
 # --- bodies of a recording
@@ -517,10 +477,11 @@ def test_a_drone_whose_markers_are_never_seen_together_is_lost(caplog):
 
 
 @pytest.mark.parametrize("fps", [25.0, 29.97])
-@pytest.mark.parametrize("rate_hz", [100.0, 25.0, 119.88, 240.0])
+@pytest.mark.parametrize("rate_hz", [100.0, 25.0, 119.88])
 @pytest.mark.parametrize("offset_s", [0.0, 0.2, -0.08, -0.1])
 def test_any_rates_and_offsets_of_recording_and_video(rate_hz, fps, offset_s):
-    truth = at_frames(make_markers(num_frames=200, rate_hz=rate_hz), fps, 12, offset_s)
+    markers = make_markers(num_frames=200, rate_hz=rate_hz)
+    truth = at_frames(markers, fps, 12, offset_s)
     # A frame at the very beginning of the recording has a position, whatever the rounding of its time.
     first = max(0, math.ceil(-offset_s * fps - 1e-9))
     assert np.flatnonzero(truth.seen[:, 0])[0] == first
@@ -606,16 +567,12 @@ def test_what_is_no_drone_for_certain_is_refused(tmp_path, markers, words):
     assert_refused(lambda: marker_bodies(markers, WHERE), f"{WHERE}", words, unchanged=tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("label", "words"),
-    [
-        ("b9", "body cf1, R01_D2.c3d: expected labels of cf1:cf11, cf1:cf12, "),
-        ("cf11", "one marker called 'cf11', found 2"),
-    ],
-)
-def test_the_label_of_no_marker_or_of_two_is_refused(tmp_path, label, words):
+def test_the_label_of_no_marker_or_of_two_is_refused(tmp_path):
     markers = with_markers(ONE, ["cf2:cf11"], 0.0)
-    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": [label]}), words, unchanged=tmp_path)
+    words = "body cf1, R01_D2.c3d: expected labels of cf1:cf11, cf1:cf12, "
+    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": ["b9"]}), words, unchanged=tmp_path)
+    words = "one marker called 'cf11', found 2"
+    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": ["cf11"]}), words, unchanged=tmp_path)
 
 
 #: Words of the line -> points, keywords of `make_c3d`.
@@ -637,16 +594,14 @@ def test_what_is_no_motion_capture_is_refused(tmp_path, words):
     assert_refused(lambda: read_c3d(path), "a.c3d: expected", words, unchanged=tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(0.9, "400 frames as its parameters say"), (0.05, "cut short in its parameters: copy it again")],
-)
-def test_a_file_that_is_cut_short_is_refused(tmp_path, share, words):
+def test_a_file_that_is_cut_short_is_refused(tmp_path):
     """ezc3d reads it without an error."""
     path = make_c3d(tmp_path / "a.c3d", np.ones((400, 3, 4)))
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
-    assert_refused(lambda: read_c3d(path), words, unchanged=tmp_path)
+    path.write_bytes(content[:-1000])
+    assert_refused(lambda: read_c3d(path), "400 frames as its parameters say", unchanged=tmp_path)
+    path.write_bytes(content[:1000])
+    assert_refused(lambda: read_c3d(path), "cut short in its parameters: copy it again", unchanged=tmp_path)
 
 
 def test_more_frames_than_a_file_holds_are_refused(tmp_path):

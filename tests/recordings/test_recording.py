@@ -33,8 +33,14 @@ def times_of(drawn) -> FrameTimes:
 @given(cameras, st.sampled_from([None, 10.0, 25.0, 60.0]))
 def test_each_instant_shows_the_nearest_frame_of_each_camera_or_none(drawn, rate_hz):
     frame_times = {f"camera{number}": times_of(each) for number, each in enumerate(drawn)}
-    # Some frame is near an instant from time 0 on.
-    assume(any(times.time_s[-1] >= 0 for times in frame_times.values()))
+    # Some frame is near an instant from time 0 on: two frames that are close together may lie between two instants.
+    instants_hz = rate_hz or max(times.fps for times in frame_times.values())
+    near = False
+    for times in frame_times.values():
+        time_s = times.time_s[times.time_s >= 0]
+        apart_s = np.abs(time_s - np.rint(time_s * instants_hz) / instants_hz)
+        near |= (apart_s * times.fps <= 0.5).any()
+    assume(near)
     timeline = make_timeline(frame_times, rate_hz)
     assert timeline.is_there.any(axis=1)[-1]
     for camera, times in enumerate(frame_times.values()):
@@ -73,18 +79,15 @@ def test_corrected_times(drawn, offset_s, drift):
     assert np.allclose(corrected.time_s, times.time_s * (1 + drift) + offset_s, atol=1e-9)
 
 
-LATE = FrameTimes(5, 10.0, -0.2)
 DROPPED = FrameTimes.listed(np.array([0.0, 0.1, 0.2, 0.4, 0.5]))
 #: Name of the case -> times of two cameras, rate of the instants, frames of both, offsets of the second in seconds.
 TIMELINES = {
-    "before time 0": ((LATE, LATE), None, [[2, 2], [3, 3], [4, 4]], [0, 0, 0]),
     "a late start": (
         (FrameTimes(4, 10.0), FrameTimes(4, 10.0, 0.23)),
         None,
         [[0, -1], [1, -1], [2, 0], [3, 1], [-1, 2], [-1, 3]],
         [0, 0, *[0.03] * 4],
     ),
-    "an early end": ((FrameTimes(3, 25.0), FrameTimes(1, 25.0)), None, [[0, 0], [1, -1], [2, -1]], [0, 0, 0]),
     "a slower camera": (
         (FrameTimes(8, 40.0), FrameTimes(2, 10.0)),
         None,
@@ -116,45 +119,20 @@ def test_timelines_by_hand(times, rate_hz, frame, offset_s):
 # --- what belongs together
 
 
-def test_cameras_are_chosen_by_their_names():
-    # Rates that differ by rounding are equal.
-    recording = full_hd_recording(c={"fps": 25.00004})
-    usable = recording.usable()
-    assert usable.rig.names == tuple(usable.videos) == LETTERS
-    assert usable.num_frames == 250
-    assert usable.fps == pytest.approx(25.0, abs=1e-4)
-    chosen = recording.usable(["d", "b"])
-    assert chosen.rig.names == tuple(chosen.videos) == ("d", "b")
-    assert recording.usable("c").rig.names == ("c",)
-
-
 def test_a_camera_without_video_is_left_out_with_a_warning(caplog):
-    recording = full_hd_recording(b=None, d=None)
+    # Rates that differ by rounding are equal.
+    recording = full_hd_recording(b=None, c={"fps": 25.00004}, d=None)
     usable = recording.usable()
     assert usable.rig.names == tuple(usable.videos) == ("a", "c", "e")
+    assert usable.num_frames == 250
     assert caplog.messages == [f"camera {name} is left out: it has no video" for name in "bd"]
-    assert recording.usable(["a", "c"]).rig.names == ("a", "c")
+    assert recording.usable(["c", "a"]).rig.names == ("c", "a")
+    assert recording.usable("c").rig.names == ("c",)
     # A camera with times alone counts where no videos are needed.
     timed = with_cameras(recording, times={"b": FrameTimes(30, 25.0)})
     assert timed.usable(videos=False).rig.names == ("a", "b", "c", "e")
-    assert timed.usable(videos=False).num_frames == 250
     assert timed.usable(["b"], videos=False).num_frames == 30
     assert full_hd_recording(**dict.fromkeys(LETTERS)).num_frames == 0
-
-
-def test_cameras_may_differ_in_size_rate_and_length():
-    recording = full_hd_recording(
-        a={"num_frames": 100},
-        b={"fps": 50.0, "num_frames": 400},
-        c={"image_size_wh": (1280, 720)},
-    )
-    recording.cameras[2].camera.image_size_wh[:] = (1280, 720)
-    usable = recording.usable()
-    assert (usable.rig.names, usable.fps) == (LETTERS, 50.0)
-    # The cameras at 25 frames per second last 10 s, the fast one 8 s.
-    timeline = usable.timeline()
-    assert usable.num_frames == timeline.num_instants == 500
-    assert timeline.frame[200].tolist() == [-1, 200, 100, 100, 100]
 
 
 def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
