@@ -27,14 +27,14 @@ os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
 os.environ["XLA_FLAGS"] = "--xla_cpu_use_fusion_emitters=false"
 
 import jax
-import lazy_checks
+import jaxtyping
 import pytest
 from hypothesis import HealthCheck, settings
 
 # jaxtyping and beartype check the types and shapes of the annotated calls of the package. The hook must be installed
 # before the package is imported. The checks take a third to a half of the time, so only `make nightly` asks for them.
 if os.environ.get("PSOTRACK_TYPE_CHECKS") == "on":
-    lazy_checks.install("psotrack")
+    jaxtyping.install_import_hook("psotrack", "beartype.beartype")
 
 from helpers import Output
 

@@ -21,6 +21,7 @@ RECORDINGS = {
     "DroneDetectionThesis/Drone-detection-dataset": "foreground: drones before sky and trees, with boxes",
     "MichaelGrupp/evo": "paths beside evo's errors",
     "QAlexBall/opencv_contrib": "photographs in which no marker may be found",
+    "TemugeB/handpose3d": "rig files; a recording without drones",
     "UbiquityRobotics/fiducials": "markers in photographs: known identities",
     "abakisita/camera_calibration": "markers in photographs: a board of markers",
     "cadop/pyCGM": "C3D files, beside ezc3d",
@@ -34,6 +35,7 @@ RECORDINGS = {
     "perfanalytics/pose2sim": "rig files of Qualisys",
     "talmolab/sleap-anipose": "a rig of three cameras from a board; rig files; a recording without drones",
     "wordbomb/PoseFree-GeoLocator": "a flight before three cameras: covariances, clocks",
+    "zhu-lebin/trackmesh_gui": "rig files of EasyMocap",
 }
 
 

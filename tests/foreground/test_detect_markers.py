@@ -14,7 +14,7 @@ from marker_pictures import Sheet, picture, rows_of_sheets
 from real_data import published
 
 from psotrack.foreground.markers import MarkerDetector, marker_dictionary
-from psotrack.recordings import VideoWriter, read_grey
+from psotrack.recordings import VideoWriter, probe, read_frames, read_grey
 
 COLUMNS = ["id", "x0_px", "y0_px", "x1_px", "y1_px", "x2_px", "y2_px", "x3_px", "y3_px", "std_px"]
 
@@ -39,12 +39,14 @@ def is_among(found, marker, quad):
     return is_it.any()
 
 
-def overlooked(gray, dictionary, found):
-    """Markers of OpenCV's that are not among the found ones."""
+def overlooked(gray, dictionary, found, smallest_cell_px=0.0):
+    """Markers of OpenCV's, with cells of this size or larger, that are not among the found ones."""
     missing = []
+    cells = marker_dictionary(dictionary).markerSize + 2
     for refinement in (cv2.aruco.CORNER_REFINE_NONE, cv2.aruco.CORNER_REFINE_SUBPIX):
         for marker, quad in opencv_markers(gray, dictionary, refinement):
-            if not is_among(found, marker, quad):
+            shortest_px = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=-1).min()
+            if shortest_px >= smallest_cell_px * cells and not is_among(found, marker, quad):
                 missing.append(marker)
     return missing
 
@@ -326,7 +328,23 @@ def test_what_opencv_finds_in_photographs_is_found(name, pattern, dictionary):
         gray = read_grey(path)
         for thorough in (False, True):
             found = MarkerDetector(dictionary, thorough=thorough).detect(gray)
-            assert overlooked(gray, dictionary, found) == [], path.name
+            # Of cells of a pixel, the samples of OpenCV's defaults are right by chance, as others are.
+            assert overlooked(gray, dictionary, found, smallest_cell_px=1.5) == [], path.name
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_inverted_boards_in_videos():
+    """In the negative, OpenCV finds the markers of these boards, of 15 to 60 pixels."""
+    folder = published("mprib/caliscope") / "tests/sessions/charuco_calibration"
+    detector = MarkerDetector("4x4_50", thorough=True)
+    for path in sorted(folder.glob("**/*.mp4")):
+        for number, frame in enumerate(read_frames(probe(path))):
+            if number in (0, 32, 64):
+                gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+                found = detector.detect(gray)
+                for marker, quad in opencv_markers(255 - gray, "4x4_50", cv2.aruco.CORNER_REFINE_NONE):
+                    assert is_among(found, marker, quad), (path.name, number)
 
 
 @pytest.mark.real

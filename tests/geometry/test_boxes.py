@@ -72,7 +72,6 @@ def test_the_box_of_a_large_near_ellipsoid_is_exact():
 
 WIDE_K = np.array([[450.0, 0.0, 640.0], [0.0, 455.0, 360.0], [0.0, 0.0, 1.0]])
 #: Coefficients, and whether the lens is a fisheye: lenses that show more than 45 degrees off the axis in `WIDE_K`.
-#: Coefficients, and whether the lens is a fisheye: lenses that show more than 45 degrees off the axis in `WIDE_K`.
 WIDE_LENSES = {
     "fisheye": ((-0.012, 0.021, -0.018, 0.004), True),
     "strong barrel": ((-0.25, 0.0, 0.0, 0.0), False),

@@ -245,7 +245,7 @@ def test_rotation_and_cross_product_matrices_equal_scipys_and_numpys():
 )
 def test_every_lens_comes_back_and_zeros_change_nothing(coefficients, numbers, xy, skew):
     size = np.array([0.4, 0.2, 0.003, 0.003, 0.1, 0.3, 0.1, 0.05, *4 * [0.002], 0.1, 0.1])
-    dist = (numbers * size)[:coefficients]
+    dist = (numbers * size)[:coefficients].tolist()
     skewed = K.copy()
     skewed[0, 1] = skew
     flat = make_camera(R=np.eye(3), t_m=np.zeros(3), K=np.eye(3), dist=dist, image_size_wh=SIZE_WH)
@@ -300,7 +300,7 @@ FRAMES = 40
 
 
 def looking(centre_m, target_m, focal_px=1000.0, dist=()):
-    R, t_m = look_at(centre_m, target_m)
+    R, t_m = look_at([float(x) for x in centre_m], [float(x) for x in target_m])
     K = np.array([[focal_px, 0, 960], [0, focal_px, 540], [0, 0, 1]])
     return make_camera(R=R, t_m=t_m, K=K, dist=dist, image_size_wh=(1920, 1080))
 
@@ -316,14 +316,12 @@ def around(target_m):
     return rig_of(centres_m, [target_m] * 3)
 
 
-#: Cameras beside each other that look away from each other, with lenses that distort.
 ANGLE = np.array([0.0, 2.1, 4.2])
 DIRECTIONS = np.stack([np.cos(ANGLE), np.sin(ANGLE), np.zeros(3)], axis=-1)
 #: Cameras beside each other that look away from each other, with lenses that distort.
 OUTWARDS = rig_of(DIRECTIONS, 9 * DIRECTIONS, focal_px=3000.0, dist=(-0.2, 0.05, 0.0, 0.0))
 #: Two cameras 100 m away from the middle, with images of 3 m there.
 FAR_M = [(-100, 0, 1), (0, -100, 1)]
-#: What it shows -> a rig, and whether views of its cameras meet.
 #: What it shows -> a rig, and whether views of its cameras meet.
 RIGS = {
     "around": (around((0.0, 0.0, 1.5)), True),

@@ -16,7 +16,6 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import jaxtyping
-import lazy_checks
 import numpy as np
 import pytest
 from helpers import ring_rig
@@ -307,7 +306,6 @@ def test_examples_in_docstrings_run(name):
 
 
 @pytest.mark.skipif(os.environ.get("PSOTRACK_TYPE_CHECKS") != "on", reason="`make nightly` checks types")
-@lazy_checks.all_calls_checked()
 def test_annotations_are_enforced():
     """The hook that checks shapes is active: without it, wrong shapes give wrong results or errors deep in the code."""
     swapped_axes = np.zeros((7, 2, 3))  # (points, 2, cameras) instead of (points, cameras, 2).

@@ -85,8 +85,9 @@ class DetectedMarkers:
 class MarkerDetector:
     """Finds the markers of a dictionary in images, black on white or inverted.
 
-    It finds what OpenCV's detector finds with its defaults in the full image, unless it does not look like the marker;
-    and markers that OpenCV overlooks. Quadrangles that are too small, folded or mirrored are left out.
+    It finds what OpenCV's detector finds with its defaults in the full image, if the marker's cells are 1.5 pixels or
+    larger and it looks like the marker; and markers that OpenCV overlooks. Quadrangles that are too small, folded or
+    mirrored are left out.
 
     Args:
         dictionary: name of the markers' dictionary, such as 4x4_1000.
