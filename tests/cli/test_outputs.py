@@ -328,7 +328,8 @@ def test_files_of_one_run_are_replaced_together(run_psotrack, root, place, monke
     for content in whole.values():
         for name in older:
             Path(name).write_bytes(OLDER)
-        with files_up_to(max(LEAST, len(content) - 1)):
+        # The digits of a record's seconds differ from run to run.
+        with files_up_to(max(LEAST, len(content) - 100)):
             result = run_psotrack(*words)
         assert_refused(lambda result=result: result, "tracks.", unchanged=place)
         assert content_of(place) == older
