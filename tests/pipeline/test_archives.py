@@ -21,7 +21,7 @@ from psotrack.foreground.silhouettes import SilhouetteSettings, compute
 from psotrack.pipeline.archives import compare_with_archive, pack_tracks, read_manifest, unpack
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.trajectories import read_trajectories, write_trajectories
+from psotrack.trajectories import Status, read_trajectories, write_trajectories
 
 CONTENT = OLD.read_bytes()
 #: Content of a small archive.
@@ -398,6 +398,23 @@ def test_the_same_tracks(compare):
     assert comparison.differences == {}
     assert comparison.sentence("a.psotrack") == "the same tracks as in a.psotrack"
     assert compare(".parquet").same
+
+
+def test_a_lost_drone_is_no_difference(flight, tmp_path):
+    archived = tmp_path / "archived"
+    shutil.copytree(flight, archived)
+    tracks = read_trajectories(archived / "tracks.csv")
+    position_m = tracks.position_m.copy()
+    position_m[4, 1] = np.nan
+    status = tracks.status.copy()
+    status[4, 1] = Status.LOST
+    lost = replace(tracks, position_m=position_m, status=status)
+    for path in (archived / "tracks.csv", tmp_path / "again.csv"):
+        write_trajectories(path, lost, force=True)
+    manifest = read_manifest(flight)
+    record = json.loads((flight / "tracks.json").read_text())
+    settings = manifest.track_settings()
+    assert compare_with_archive(archived, manifest, tmp_path / "again.csv", record, settings).same
 
 
 def test_other_tracks_in_words(compare, flight):

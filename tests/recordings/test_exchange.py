@@ -306,6 +306,30 @@ def test_a_drone_that_is_lost_has_no_box(tmp_path, footage):
     assert sorted(table[:, :2].tolist()) == (np.argwhere(tracks.seen) + 1).tolist()
 
 
+def test_boxes_have_the_size_that_the_command_is_told(run_psotrack, flight, tmp_path):
+    tracks = make_tracks_file(tmp_path / "tracks.csv")
+    tracks.with_suffix(".json").unlink()
+    widths_px = {}
+    for size_m in (0.2, 0.4):
+        out = tmp_path / f"{size_m}"
+        words = [
+            "export",
+            tracks,
+            flight,
+            "--to",
+            "mot",
+            "--drone-size",
+            f"{size_m},{size_m},0.2",
+            "--out",
+            out,
+        ]
+        assert run_psotrack(*words).code == 0
+        (path, *_) = sorted(out.rglob("data/*.txt"))
+        widths_px[size_m] = np.loadtxt(path, delimiter=",")[:, 4]
+    # The drones are far away, so that perspective changes the widths' ratio by less than a tenth.
+    np.testing.assert_allclose(widths_px[0.4] / widths_px[0.2], 2.0, rtol=0.1)
+
+
 class Message(NamedTuple):
     """A message of a bag, read by rosbags."""
 
