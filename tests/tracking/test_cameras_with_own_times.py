@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drawn_flights import REDUCTION, SIZE_M, draw, run_inputs
 from drawn_flights import RIG as DRAWN_RIG
-from helpers import ROOM_M, cameras_of, ring_rig, with_cameras
+from helpers import ROOM_M, cameras_of, ring_rig, silhouettes_in_memory, with_cameras
 from hypothesis import given
 from hypothesis import strategies as st
 from seen_boxes import FPS, track, true_boxes
@@ -18,6 +18,7 @@ from psotrack.calibration.clocks import (
     camera_offsets,
     clocks_of_tracks,
     fit_clocks,
+    places_of_tracks,
 )
 from psotrack.calibration.doctor import examine
 from psotrack.evaluation import find_offset
@@ -204,6 +205,23 @@ def near(time_s):
     """(frames, 1, 3), a drone on a circle in the middle of the room, 1.6 m/s."""
     turn = 1.6 * time_s
     return np.stack([np.cos(turn), np.sin(turn), 1.2 + 0.2 * np.sin(0.7 * turn)], axis=-1)[:, None]
+
+
+def test_a_drones_place_is_the_middle_of_its_foreground():
+    """Sightings with edges in whole cells say where to look, and the foreground says where the drone is."""
+    time_s = np.arange(6) / FPS
+    position_m = near(time_s)
+    velocity_m_s = (near(time_s + 1e-4) - near(time_s - 1e-4)) / 2e-4
+    silhouettes = silhouettes_in_memory(DRAWN_RIG, draw(position_m, SIZE_M[:1]), REDUCTION)
+    centre_px, size_px = true_boxes(DRAWN_RIG, position_m, SIZE_M[0, 1:])
+    sightings = Sightings(np.round(centre_px), size_px, np.full(size_px.shape[:-1], NOISE_PX))
+    timeline = make_timeline(alike(6, DRAWN_RIG.names))
+    places_px = places_of_tracks(
+        DRAWN_RIG.cameras, sightings, timeline, position_m, velocity_m_s, silhouettes
+    )
+    true_px, _ = project(DRAWN_RIG.cameras, position_m[:, :, None])
+    # A quarter of a cell: the middle of an outline of 30 px that perspective bends.
+    np.testing.assert_allclose(places_px, true_px, rtol=0, atol=0.5)
 
 
 @pytest.mark.slow
