@@ -34,7 +34,7 @@ from hypothesis import HealthCheck, settings
 # jaxtyping and beartype check the types and shapes of the annotated calls of the package. The hook must be installed
 # before the package is imported. The checks take a third to a half of the time, so only `make nightly` asks for them.
 if os.environ.get("PSOTRACK_TYPE_CHECKS") == "on":
-    jaxtyping.install_import_hook("psotrack", "beartype.beartype")
+    jaxtyping.install_import_hook("psotrack", "checked_types.checked")
 
 from helpers import Output
 

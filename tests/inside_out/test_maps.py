@@ -382,7 +382,7 @@ def test_exchanged_markers_are_findings(noisy_sightings, pairs, rolls, left_out)
 
 def test_a_map_of_another_room_is_one_finding(noisy_sightings):
     names = np.array(list(ROOM))
-    shuffled = np.random.default_rng(4).permutation(names)
+    shuffled = np.random.default_rng(4).permutation(names).tolist()
     other_m = dict(zip(names.tolist(), MarkerMap(ROOM).corners_of(shuffled), strict=True))
     checkup = check_map(noisy_sightings, MarkerMap(other_m))
     assert [one.kind for one in checkup.findings] == ["map"]

@@ -5,6 +5,7 @@ import signal
 import sys
 from collections import defaultdict
 from functools import partial
+from types import ModuleType
 from unittest.mock import Mock, call
 
 import numpy as np
@@ -339,6 +340,9 @@ def pyglet(monkeypatch):
         modules = {name: Mock() for name in ("app", "input", "shapes", "window")} | changed
         monkeypatch.setitem(sys.modules, "pyglet", modules.pop("pyglet", Mock()))
         for name, module in modules.items():
+            if module is not None:
+                # `isinstance` takes the fake for a module, as the annotations want.
+                module.__class__ = ModuleType
             monkeypatch.setitem(sys.modules, f"pyglet.{name}", module)
         return modules
 
