@@ -314,6 +314,12 @@ def bmp(width: int, height: int) -> bytes:
     return with_bytes(encoded(".bmp"), 18, struct.pack("<ii", width, -height))
 
 
+def bmp_of_runs(width: int, height: int) -> bytes:
+    """Runs of equal pixels (RLE8): the end of the image in two bytes."""
+    header = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 8, 1, 0, 0, 0, 256, 0)
+    return b"BM" + struct.pack("<IHHI", 1080, 0, 0, 1078) + header + bytes(1024) + b"\0\1"
+
+
 def tiff(width: int, height: int, order: str = "<") -> bytes:
     tags = [(256, width), (257, height), (258, 8), (259, 1), (262, 1), (273, 200), (277, 1), (278, height)]
     entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags)
@@ -332,7 +338,7 @@ def tiff_of_motorola(width: int, height: int) -> bytes:
 #: What writes an image of a claimed size.
 IMAGES = [png, jpeg, progressive_jpeg, jpeg_with_a_comment, bmp, pnm]
 #: What writes the beginning of one.
-BEGINNINGS = [tiff, tiff_of_motorola]
+BEGINNINGS = [bmp_of_runs, tiff, tiff_of_motorola]
 
 
 @pytest.mark.parametrize("make", IMAGES + BEGINNINGS)
@@ -455,21 +461,38 @@ def test_a_video_that_claims_to_last_for_days(tmp_path, little_memory):
 # --- networks
 
 
-@pytest.mark.parametrize("word", [b"\x08location", b"\x88\x00location"], ids=["shortest", "superfluous zero"])
-def test_a_network_that_reads_another_file(word, tmp_path):
-    """OpenCV reads every file that a tensor names. The length of a word may have more bytes than it needs."""
+#: Name of the case -> whether the tensor is an initializer or the value of a node, the file that the tensor names, and
+#: the bytes of the word "location", whose length may have more bytes than it needs.
+OTHER_FILES = {
+    "initializer": (True, "secret.bin", b"\x08location"),
+    "node": (False, "secret.bin", b"\x08location"),
+    "folder above": (True, "../secret.bin", b"\x08location"),
+    "superfluous zero": (False, "secret.bin", b"\x88\x00location"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_FILES)
+def test_a_network_that_reads_another_file(name, tmp_path, monkeypatch):
+    """OpenCV reads every file that a tensor names."""
+    is_initializer, place, word = OTHER_FILES[name]
     shape = (1, 3, 64, 64)
     values = np.full(shape, 7, np.float32)
-    (tmp_path / "secret.bin").write_bytes(values.tobytes())
+    path = tmp_path / "in" / "net.onnx"
+    path.parent.mkdir()
+    (path.parent / place).write_bytes(values.tobytes())
     message = onnx_models._message
-    location = message((1, "location"), (2, "secret.bin")).replace(b"\x08location", word)
+    location = message((1, "location"), (2, place)).replace(b"\x08location", word)
     sides = [(1, side) for side in shape]
     tensor = message(*sides, (2, 1), (8, "secret"), (13, location), (14, 1))
-    value = message((1, "value"), (5, tensor), (20, 4))
-    constant = message((2, "secret"), (4, "Constant"), (5, value))
     add = onnx_models._node("Add", ["images", "secret"], "output")
-    path = tmp_path / "net.onnx"
-    path.write_bytes(onnx_models.model([constant, add], {}, shape, shape))
+    if is_initializer:
+        monkeypatch.setattr(onnx_models, "_tensor", lambda name, values: tensor)
+        content = onnx_models.model([add], {"secret": values}, shape, shape)
+    else:
+        value = message((1, "value"), (5, tensor), (20, 4))
+        constant = message((2, "secret"), (4, "Constant"), (5, value))
+        content = onnx_models.model([constant, add], {}, shape, shape)
+    path.write_bytes(content)
     found = "found tensors in other files"
     assert_refused(lambda: OnnxDetector(path, DetectorSettings(size=64)), path, found, unchanged=tmp_path)
 

@@ -4,85 +4,22 @@ from __future__ import annotations
 
 import argparse
 import collections
-import logging
-import multiprocessing
 import os
-import resource
 import sys
 import tempfile
 import threading
 import time
-from multiprocessing.connection import Connection
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import click
 
 from fuzz.formats import FORMATS
-from fuzz.trial import Judge, Trial
+from fuzz.trial import Trial
+from fuzz.worker import NAMES, Worker
 
 #: Folder of files that failed.
 FINDS = Path("build/fuzz")
-NAMES = tuple(FORMATS)
-#: Longest time of a try before its process is ended, seconds.
-_HANGS_S = 60.0
-#: Address space of a process beyond what the libraries take, bytes; threads and arenas reserve much of it.
-_ADDRESSES = 4 << 30
-
-
-def _serve(connection: Connection, folder: Path, seed: int) -> None:
-    """Make the tries whose numbers come through the connection, in a process of its own."""
-    # Warnings of the log are no text of libraries.
-    logging.getLogger().addHandler(logging.NullHandler())
-    # What commands print is no part of the report.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    judge = Judge(folder, seed)
-    held = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    resource.setrlimit(resource.RLIMIT_AS, (held + _ADDRESSES, resource.RLIM_INFINITY))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    connection.send(None)
-    while True:
-        connection.send(judge.attempt(connection.recv()))
-
-
-class Worker:
-    """A process that makes tries, and is replaced when it dies or hangs."""
-
-    def __init__(self, folder: Path, seed: int) -> None:
-        self._folder, self._seed = folder, seed
-        self._process = None
-        self._starts = 0
-
-    def attempt(self, number: int) -> Trial:
-        """The try of a number; without a content if the process ended."""
-        if self._process is None:
-            self._start()
-        try:
-            self._connection.send(number)
-            if self._connection.poll(_HANGS_S):
-                return self._connection.recv()
-            ended = f"hangs for {_HANGS_S:g} s"
-        except (EOFError, OSError):
-            self._process.join(5)
-            ended = f"the process died with exit code {self._process.exitcode}"
-        self.stop()
-        return Trial(number, NAMES[number % len(NAMES)], "", ended, False, b"")
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, other = context.Pipe()
-        self._starts += 1
-        words = (other, self._folder / f"{self._starts}", self._seed)
-        self._process = context.Process(target=_serve, args=words, daemon=True)
-        self._process.start()
-        other.close()
-        self._connection.recv()
-
-    def stop(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.join()
-            self._process = None
 
 
 def main() -> None:
@@ -119,19 +56,22 @@ def main() -> None:
         finds[key] += 1
         if finds[key] > 1:
             return
-        FINDS.mkdir(parents=True, exist_ok=True)
-        suffix = Path(FORMATS[trial.name].file).suffix
-        path = FINDS / f"{trial.name}-{options.seed}-{trial.number}{suffix}"
-        path.write_bytes(trial.content)
-        click.echo(f"FAILED try {trial.number}, {trial.name}, {trial.call}: {trial.fault} ({path})")
+        kept = ""
+        # The content of a try whose process ended is made again by the seed and the number.
+        if trial.content:
+            FINDS.mkdir(parents=True, exist_ok=True)
+            suffix = Path(FORMATS[trial.name].file).suffix
+            path = FINDS / f"{trial.name}-{options.seed}-{trial.number}{suffix}"
+            path.write_bytes(trial.content)
+            kept = f" ({path})"
+        click.echo(f"FAILED try {trial.number}, {trial.name}, {trial.call}: {trial.fault}{kept}")
 
-    threads = []
+    jobs = os.sched_getaffinity(0)
     with tempfile.TemporaryDirectory(prefix="psotrack-fuzz-", ignore_cleanup_errors=True) as root:
-        for job in os.sched_getaffinity(0):
-            threads.append(threading.Thread(target=work, args=(Path(root, f"{job}"),)))
-            threads[-1].start()
-        for thread in threads:
-            thread.join()
+        folders = [Path(root, f"{job}") for job in jobs]
+        with ThreadPoolExecutor(len(jobs)) as threads:
+            # To take the results raises the error of a thread.
+            list(threads.map(work, folders))
     click.echo(
         f"{len(done)} tries of {len(NAMES)} formats with seed {options.seed}, from try {options.first} on, in "
         f"{time.monotonic() - began_s:.0f} s: {sum(done)} files refused, {sum(finds.values())} failures"

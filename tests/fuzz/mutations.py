@@ -75,7 +75,22 @@ def members(random: Random, content: bytes) -> bytes:
 
 
 #: Values of cells of Parquet tables.
-_CELLS = [None, float("nan"), float("inf"), -1, 1.5, 2**53, -(2**62), "x", "", True, b"\xff", [1], {"a": 1}]
+_CELLS = [
+    None,
+    float("nan"),
+    float("inf"),
+    -1,
+    0,
+    1.5,
+    2**53,
+    -(2**62),
+    "x",
+    "",
+    True,
+    b"\xff",
+    [1],
+    {"a": 1},
+]
 
 
 def columns(random: Random, content: bytes) -> bytes:
@@ -89,24 +104,25 @@ def columns(random: Random, content: bytes) -> bytes:
         name, values = table.column_names[index], table.column(index).to_pylist()
     except (pa.ArrowException, OSError, ValueError):  # an earlier change made the table unreadable
         return content
+    row = random.randrange(max(len(values), 1))
     kind = random.random()
-    if kind < 0.2:
+    if kind < 0.15:
         table = table.remove_column(index)
-    elif kind < 0.4:
-        names = list(table.column_names)
-        names[index] = random.choice(names)
-        table = table.rename_columns(names)
+    elif kind < 0.25:
+        other = random.choice(table.column_names)
+        table = table.rename_columns([other if each == name else each for each in table.column_names])
+    elif kind < 0.35:
+        table = table.slice(0, row)
+    elif kind < 0.45:
+        table = pa.concat_tables([table, table.slice(row, 1)])
     else:
         value = random.choice(_CELLS)
-        if kind > 0.7:
-            values = [value] * len(values)
-        elif values:
-            values[random.randrange(len(values))] = value
+        # One cell, or all of the column.
+        values = [value if kind > 0.7 or place == row else each for place, each in enumerate(values)]
         try:
-            column = pa.array(values)
+            table = table.set_column(index, name, [pa.array(values)])
         except (pa.ArrowException, TypeError, OverflowError):  # no column can hold these values together
-            column = pa.array(map(str, values), pa.string())
-        table = table.set_column(index, name, [column])
+            table = table.set_column(index, name, [pa.array(map(str, values), pa.string())])
     out = io.BytesIO()
     pq.write_table(table, out)
     return out.getvalue()
@@ -152,6 +168,12 @@ def _cut(random: Random, content: bytes) -> bytes:
     return content[: random.randrange(len(content) + 1)]
 
 
+def _insert(random: Random, content: bytes) -> bytes:
+    start = random.randrange(len(content) + 1)
+    new = random.choice((b"\x00", b"\xff\xfe", b"\xc3", b"\xef\xbb\xbf", b"\r", random.randbytes(9)))
+    return content[:start] + new + content[start:]
+
+
 def _piece(random: Random, content: bytes) -> bytes:
     """A piece is left out, written twice or erased."""
     start = random.randrange(len(content) + 1)
@@ -160,7 +182,7 @@ def _piece(random: Random, content: bytes) -> bytes:
     return content[:start] + new + content[start + len(piece) :]
 
 
-_OF_BYTES: tuple[Change, ...] = (_flip, _integer, _cut, _piece)
+_OF_BYTES: tuple[Change, ...] = (_flip, _flip, _integer, _integer, _cut, _insert, _piece, _piece, _piece)
 
 
 # --- texts
@@ -185,7 +207,7 @@ def _lines(random: Random, content: bytes) -> bytes:
     lines = content.split(b"\n")
     place = random.randrange(len(lines))
     line = lines[place]
-    kind = random.randrange(5)
+    kind = random.randrange(7)
     if kind == 0:
         del lines[place]
     elif kind == 1:
@@ -194,9 +216,12 @@ def _lines(random: Random, content: bytes) -> bytes:
         lines[place] = line[: random.randrange(len(line) + 1)]
     elif kind == 3:
         random.shuffle(lines)
+    elif kind == 4:
+        lines[place] = line + b"\r"
+    elif kind == 5:
+        lines = lines[: place + 1]
     else:
-        end = random.choice((b"\r\n", b"\r", b"\n\n", b"\x0b", b"\xe2\x80\xa8"))
-        return end.join(lines)
+        return content.replace(b"\n", random.choice((b"\r\n", b"\r", b"\n\n", b"\x0b", b"\xe2\x80\xa8")))
     return b"\n".join(lines)
 
 

@@ -11,10 +11,11 @@ from fuzz.trial import Judge
 
 from psotrack.errors import InputError
 
+TESTS = Path(__file__).parents[1]
 #: Number of tries per format.
 TRIES = 5
 #: Files that a reader once treated wrongly, in folders with the names of their formats.
-FINDS = sorted(path for path in (Path(__file__).parents[1] / "data" / "fuzz").rglob("*") if path.is_file())
+FINDS = sorted(path for path in (TESTS / "data" / "fuzz").rglob("*") if path.is_file())
 #: Finds that are long and regular, or the most part of another file.
 MADE = {
     "tracks-json": b'{"a":' * 20_000,
@@ -50,6 +51,16 @@ def test_damaged_files_are_read_or_refused_in_one_line(name, judges):
     trials = [judge.attempt(number) for number in range(1 if FORMATS[name].is_slow else TRIES)]
     assert [trial for trial in trials if trial.fault] == []
     assert FORMATS[name].is_slow or len({trial.content for trial in trials}) > TRIES // 2
+
+
+@pytest.mark.nightly
+def test_the_program_makes_tries(start_python):
+    """Found: its processes died at their start, and the program ended with exit code 0."""
+    environment = os.environ | {"PYTHONPATH": f"{TESTS.parent}:{TESTS}"}
+    program = start_python("-m", "fuzz", "--tries", 3, env=environment)
+    said, _ = program.communicate()
+    assert said.startswith("3 tries of ")
+    assert program.returncode == 0
 
 
 def judged(judge, name, content):
