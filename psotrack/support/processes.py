@@ -19,6 +19,7 @@ from typing import Any, NoReturn, TypeVar
 import cv2
 
 from psotrack.errors import PsotrackError
+from psotrack.support.files import remove_temporary_files
 from psotrack.support.progress import Advance
 
 _Task = TypeVar("_Task")
@@ -172,4 +173,7 @@ def _end_in_silence(number: int, frame: FrameType | None) -> NoReturn:
     What libraries say when they are interrupted is not for the user: the parent process says why it ends.
     """
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    # The exception may end a clean-up that has already begun.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    remove_temporary_files()
     sys.exit(1)

@@ -21,7 +21,7 @@ import pytest
 from helpers import assert_refused, cameras_of, far_camera, make_once, with_cameras
 from hypothesis import given
 from hypothesis import strategies as st
-from worker_tasks import double
+from worker_tasks import double, fail_and_be_ended
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.foreground.silhouettes import (
@@ -419,6 +419,13 @@ def test_results_come_in_the_order_of_tasks_and_a_process_that_dies_is_said():
     died = "a worker process: expected a result, found that the process died"
     with pytest.raises(PsotrackError, match=died):
         map_in_processes(double, [1, -1, 3], jobs=2, advance=done.append)
+
+
+def test_a_worker_that_is_ended_while_it_cleans_up_leaves_nothing(tmp_path):
+    """Found: the folder of half an array, where the signal came while the folder was being removed."""
+    with pytest.raises(PsotrackError, match="the process died"):
+        map_in_processes(fail_and_be_ended, [tmp_path / "a", tmp_path / "b"], jobs=2, advance=int)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_workers_do_not_import_jax():
