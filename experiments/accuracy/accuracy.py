@@ -2,6 +2,7 @@
 
     python experiments/accuracy/accuracy.py reference --data data           # the table against which changes are judged
     python experiments/accuracy/accuracy.py real_flights --data data --real REAL
+    python experiments/accuracy/accuracy.py baseline --data data --real REAL
     python experiments/accuracy/accuracy.py covariances --data data
     python experiments/accuracy/accuracy.py association --data data --real REAL
     python experiments/accuracy/accuracy.py markers --real REAL
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import association
+import baseline
 import covariances
 import localise
 import markers
@@ -36,6 +38,7 @@ import _results
 STUDIES = {
     "reference": reference,
     "real_flights": real_flights,
+    "baseline": baseline,
     "covariances": covariances,
     "association": association,
     "markers": markers,

@@ -311,22 +311,30 @@ def add_options(options: argparse.ArgumentParser) -> None:
     """This study has no options of its own."""
 
 
+def recordings(data: Path, real: Path) -> Iterator[tuple[Path, int, float]]:
+    """Folder, number of frames and gate of each flight, metres; makes those that are not there."""
+    for name, (read, num_frames, *_) in FLIGHTS.items():
+        folder = data / "real_flights" / name
+        if not (folder / "recording.toml").exists():
+            make_recording(folder, *read(real))
+        yield folder, num_frames, GATE_M
+    for name, part in BATS.items():
+        folder = data / "real_flights" / name.replace(" ", "_")
+        if not (folder / "recording.toml").exists():
+            flight = read_flight(real, *part[:2], BAT_FRAMES)
+            write_recording(flight, folder)
+            write_trajectories(folder / "truth.csv", flight.truth, force=True)
+        yield folder, BAT_FRAMES, BAT_GATE_M
+
+
 def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
     """Name and function of each row."""
-    folder, real = options.data / "real_flights", options.real
-    for name, (read, num_frames, left_out, num_left_out) in FLIGHTS.items():
-        if not (folder / name / "recording.toml").exists():
-            make_recording(folder / name, *read(real))
-        yield name, partial(by_truth, folder, name, num_frames, GATE_M)
+    for folder, num_frames, gate_m in recordings(options.data, options.real):
+        yield folder.name, partial(by_truth, folder.parent, folder.name, num_frames, gate_m)
+        *_, left_out, num_left_out = FLIGHTS.get(folder.name, ((), 0))
         for camera in left_out:
-            yield f"{name} {camera}", partial(by_camera, folder, name, camera, num_left_out)
-    for name, part in BATS.items():
-        short = name.replace(" ", "_")
-        if not (folder / short / "recording.toml").exists():
-            flight = read_flight(real, *part[:2], BAT_FRAMES)
-            write_recording(flight, folder / short)
-            write_trajectories(folder / short / "truth.csv", flight.truth, force=True)
-        yield short, partial(by_truth, folder, short, BAT_FRAMES, BAT_GATE_M)
+            row = partial(by_camera, folder.parent, folder.name, camera, num_left_out)
+            yield f"{folder.name} {camera}", row
 
 
 def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
