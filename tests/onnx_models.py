@@ -75,8 +75,9 @@ def bright_squares(layout: str, size: int) -> bytes:
     The score is sigmoid(40 (mean - 0.75)): 0.9999 for white, 0.5 if a quarter is black, 1e-13 for black.
 
     Args:
-        layout: layout of the output: "v5", "v8", "v10" (the first 300 boxes only), "logits" ("v8" without the
-            sigmoid), or "none" (a layout that the detector does not know).
+        layout: layout of the output: "v5", "v8", "v10" (the first 300 boxes only), "suppressed" (the same of class 0),
+            "swapped" (class before score), "middles" (three classes), "shares" ("v8" in shares of the side), "oriented"
+            ("v8" with angles), "logits" ("v8" without the sigmoid), or "none" (one that the detector does not know).
         size: side of the input image, pixels.
     """
     cells = (size - SIDE) // STRIDE + 1
@@ -90,11 +91,17 @@ def bright_squares(layout: str, size: int) -> bytes:
         "kernel": np.full((1, 3, SIDE, SIDE), 40 / (3 * SIDE * SIDE), np.float32),
         "bias": np.array([-30.0], np.float32),
         "flat": np.array([1, 1, n], np.int64),
-        "boxes": (corners if layout == "v10" else middles)[None].astype(np.float32),
+        "boxes": (corners if layout in ("v10", "suppressed", "swapped") else middles)[None].astype(
+            np.float32
+        ),
         "one": np.ones((1, 1, n), np.float32),
         "zero": np.zeros((1, 1, n), np.float32),
         "first": np.arange(300, dtype=np.int64),
+        "class": np.arange(n, dtype=np.float32)[None, None] % 3,
+        "angle": np.full((1, 1, n), -0.5, np.float32),
     }
+    if layout == "shares":
+        tensors["boxes"] /= size
     kernel_shape, strides = [SIDE, SIDE], [STRIDE, STRIDE]
     nodes = [
         _node("Conv", ["images", "kernel", "bias"], "sums", kernel_shape=kernel_shape, strides=strides),
@@ -105,11 +112,13 @@ def bright_squares(layout: str, size: int) -> bytes:
     if layout == "none":
         nodes.append(_node("Identity", ["map"], "output"))
         return model(nodes, tensors, shape, (1, 1, cells, cells))
-    if layout in ("v8", "logits"):
+    if layout in ("v8", "logits", "shares", "oriented"):
         # Two classes; the score of the first class is always 0.
-        nodes.append(_node("Concat", ["boxes", "zero", "scores"], "output", axis=1))
+        last = ["scores", "angle"] if layout == "oriented" else ["zero", "scores"]
+        nodes.append(_node("Concat", ["boxes", *last], "output", axis=1))
         return model(nodes, tensors, shape, (1, 6, n))
-    nodes.append(_node("Concat", ["boxes", "scores", "one"], "columns", axis=1))
+    last = {"suppressed": ["scores", "zero"], "swapped": ["zero", "scores"], "middles": ["scores", "class"]}
+    nodes.append(_node("Concat", ["boxes", *last.get(layout, ["scores", "one"])], "columns", axis=1))
     chosen = "columns"
     if layout == "v10":
         chosen, n = "chosen", 300

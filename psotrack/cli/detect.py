@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,8 @@ from psotrack.settings import TrackSettings
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
+
+logger = logging.getLogger(__name__)
 
 #: Image pixels per pixel in which masks are computed: all, because masks are looked at and compared pixel by pixel.
 MASKS_REDUCTION = 1
@@ -113,6 +116,10 @@ def _write(output: Output, sequence: Path, recording: Recording, out: Path | Non
     for name, detections in found:
         write_detections(files[name], detections)
         counts[name] = len(detections)
+    if not any(counts.values()):
+        logger.warning(
+            "%s: not a box in the whole recording; does --detector find drones, at its --size?", out
+        )
     frames = sum(video.num_frames for video in recording.videos.values())
     output.json({"out": str(out), "frames": recording.num_frames, "detections": counts})
     per_frame = sum(counts.values()) / frames

@@ -23,6 +23,7 @@ from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.settings import TrackingSettings, chosen_settings
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
+from psotrack.foreground.detection import Layout
 from psotrack.support import write_json
 
 
@@ -50,6 +51,7 @@ def track(
     ],
     detector: Annotated[str | None, says(metavar="MODEL.onnx|NAME")] = None,
     detector_size: Annotated[int, says(rare=True)] = DETECTOR_SIZE,
+    detector_layout: Annotated[Layout | None, says(rare=True)] = None,
     causal: bool = False,
     most_drones: MostDrones = 16,
     extent: Extent,
@@ -78,6 +80,7 @@ def track(
         detector: detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a
             detector NAME that an installed package adds. Its detections are stored.
         detector_size: side of the network's square input, in pixels.
+        detector_layout: layout of the network's output, as `psotrack detect --layout`. None: told by the output.
         causal: track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.
         most_drones: largest number of drones at one time with --causal.
     """
@@ -99,7 +102,8 @@ def track(
     if detector is not None:
         if causal:
             raise SettingsError("--detector", expected="none with --causal", found=detector)
-        parts["detector"] = find_detector(detector, DetectorSettings(size=detector_size))
+        network = DetectorSettings(size=detector_size, layout=detector_layout)
+        parts["detector"] = find_detector(detector, network)
     keep_compiled(compiled_folder(extent.cache))
     start_s = output.elapsed_s
     opened = open_recording(sequence)

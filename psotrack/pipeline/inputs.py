@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from psotrack.tracking.births import (
     start_source,
 )
 from psotrack.tracking.matching import Sightings, from_detections, from_silhouettes
+
+logger = logging.getLogger(__name__)
 
 
 def usable_for(
@@ -122,6 +125,8 @@ def read_sightings(
         return from_silhouettes(silhouettes, report), dict(silhouettes.keys)
     files = detection_files_of(recording, source)
     detections = {name: read_detections(path) for name, path in files.items()}
+    if not any(map(len, detections.values())):
+        logger.warning("no camera has a detection in the whole recording; does the detector find drones?")
     num_frames = max(times.num_frames for times in recording.exposed.values())
     sightings = from_detections(detections, recording.rig, num_frames)
     keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}

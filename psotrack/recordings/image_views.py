@@ -24,6 +24,7 @@ from psotrack.geometry import (
 )
 from psotrack.recordings.recording import Recording
 from psotrack.recordings.timing import nearest_frames
+from psotrack.support import as_written
 from psotrack.trajectories import Trajectories
 
 #: Number of instants that are projected together, which bounds the memory of long flights.
@@ -99,6 +100,7 @@ def ellipse_outlines_px(
     return middle_px[..., None, :] + np.einsum("...ij,...j,pj->...pi", directions, half_px, circle)
 
 
+@as_written()
 def _boxes_px(
     recording: Recording,
     position_m: Float[np.ndarray, "frames drones 3"],

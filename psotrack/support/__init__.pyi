@@ -1,6 +1,6 @@
 from .array_checks import first_repeat, first_repeated, first_true, has_negative_eigenvalue
 from .calls import check_records, checked
-from .compiled import drop_programs_if_many, keep_compiled, measured_compiling
+from .compiled import as_written, drop_programs_if_many, keep_compiled, measured_compiling
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, FAINT, INK, LINE, STYLE, drone_colour, save_figure
@@ -85,6 +85,7 @@ __all__ = [
     "Table",
     "TextRow",
     "are_numbers",
+    "as_written",
     "assign",
     "atomic_write",
     "atomic_write_all",

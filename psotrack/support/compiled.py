@@ -1,4 +1,4 @@
-"""Compiled programs: a cache on disk, so that JAX compiles each once per machine, and a bound on those in memory.
+"""Compiled programs: the settings that they are written for, a cache on disk, and a bound on those in memory.
 
 Also the time that JAX takes to compile, which figures of speed count apart from the work.
 """
@@ -16,6 +16,8 @@ from typing import Any
 
 import jax
 
+from psotrack.support.devices import check_devices
+
 logger = logging.getLogger(__name__)
 
 #: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
@@ -28,6 +30,30 @@ _MAP_LIMIT = Path("/proc/sys/vm/max_map_count")
 _FAILED = re.compile(r"Error (reading|writing) persistent compilation cache entry for '([\w.]+)'")
 #: Beginning of JAX's names of the events of tracing, lowering, compiling, and loading compiled programs.
 _COMPILING = "/jax/core/compile/"
+
+
+@contextlib.contextmanager
+def as_written(*, float64: bool = False) -> Iterator[None]:
+    """Within this block or function, and in this thread, JAX has the settings that the package is written for.
+
+    Users choose others for programs of their own, by variables such as `JAX_ENABLE_X64`. The package's compiled
+    programs state their types, use NaN and infinity for what is not known, and broadcast on purpose.
+
+    Args:
+        float64: whether the programs compute in float64, instead of float32.
+
+    Raises:
+        SettingsError: JAX does not find the devices that `JAX_PLATFORMS` asks for.
+    """
+    check_devices()
+    with (
+        jax.enable_x64(float64),
+        jax.debug_nans(False),
+        jax.debug_infs(False),
+        jax.numpy_rank_promotion("allow"),
+        jax.disable_jit(False),
+    ):
+        yield
 
 
 def keep_compiled(folder: Path | str) -> None:

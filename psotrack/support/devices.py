@@ -9,6 +9,7 @@ from typing import Literal
 from psotrack.errors import SettingsError, install_command
 
 Device = Literal["cpu", "gpu"]
+_GPU_NEEDS = f"a GPU needs NVIDIA's driver and {install_command('cuda')}"
 
 
 def use_device(device: Device) -> None:
@@ -20,17 +21,29 @@ def use_device(device: Device) -> None:
     import jax
 
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    remedy = f"a GPU needs NVIDIA's driver and {install_command('cuda')}" if device == "gpu" else ""
-    try:
-        found = jax.default_backend()
-    except (RuntimeError, AssertionError) as error:
-        # JAX raises AssertionError if it is installed without support for the device.
-        why = str(error).partition("\n")[0] or "no device that JAX can use"
-        raise SettingsError("--device", expected=f"a {device}", found=why, remedy=remedy) from error
+    remedy = _GPU_NEEDS if device == "gpu" else ""
+    found = _backend("--device", f"a {device}", remedy)
     if found != device:
         raise SettingsError(
             "--device", expected=f"a {device}", found=f"{found} in use already", remedy=remedy
         )
+
+
+def check_devices() -> None:
+    """Raise `SettingsError` if JAX does not find the devices that the user chose for all of its programs."""
+    _backend("JAX_PLATFORMS", "devices that JAX finds", f"{_GPU_NEEDS}; cpu is always there")
+
+
+def _backend(where: str, expected: str, remedy: str) -> str:
+    """Kind of the devices on which JAX computes."""
+    import jax
+
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:
+        # JAX raises AssertionError if it is installed without support for the device.
+        why = str(error).partition("\n")[0] or "no device that JAX can use"
+        raise SettingsError(where, expected=expected, found=why, remedy=remedy) from error
 
 
 def share_processors(count: int | None = None) -> None:

@@ -15,8 +15,9 @@ from psotrack.recordings import VideoWriter, probe, read_detections
 from psotrack.recordings.datasets import CALIBRATION
 from psotrack.trajectories import read_trajectories
 
-#: Layout of the output -> side of the network's input, pixels. "v10" needs at least 300 boxes, so 18 x 18 boxes.
-SIZES = {"v5": 128, "v8": 128, "v10": 168}
+#: Layout of the output -> side of the network's input, pixels. "v10" needs at least 300 boxes, so 18 x 18 boxes; a
+#: network with a suppression of its own mostly has 100.
+SIZES = {"v5": 128, "v8": 128, "v10": 168, "suppressed": 104, "swapped": 104, "shares": 128, "middles": 104}
 #: Pixels of the image per pixel of the network's input.
 SCALE = 2
 #: (frames, 3), positions of a drone, metres.
@@ -27,7 +28,7 @@ PLACES_M = np.linspace([-0.3, -0.2, 1.4], [0.3, 0.2, 1.6], 12)
 def models(tmp_path_factory):
     """A folder with the networks, and files that are none."""
     folder = tmp_path_factory.mktemp("models")
-    for layout in (*SIZES, "logits", "none"):
+    for layout in (*SIZES, "logits", "none", "oriented"):
         content = bright_squares(layout, SIZES.get(layout, 128))
         (folder / f"{layout}.onnx").write_bytes(content)
     (folder / "cut.onnx").write_bytes(bright_squares("v5", 128)[:3000])
@@ -51,9 +52,10 @@ def painted(size, *squares, value=255):
     return bgr
 
 
-def detector(models, layout, **settings):
-    settings = {"size": SIZES.get(layout, 128)} | settings
-    return OnnxDetector(models / f"{layout}.onnx", DetectorSettings(**settings))
+def detector(models, name, **settings):
+    said = "middles" if name == "middles" else None
+    settings = {"size": SIZES.get(name, 128), "layout": said} | settings
+    return OnnxDetector(models / f"{name}.onnx", DetectorSettings(**settings))
 
 
 @pytest.mark.parametrize("layout", SIZES)
@@ -116,7 +118,20 @@ BAD = {
     "cut": ({}, "cut.onnx: expected an ONNX model that OpenCV can read"),
     "v8": ({"size": 96}, "expected a network for images of 96 x 96 pixels", "--size"),
     "none": ({}, "none.onnx: expected an output in a layout of YOLO, found (1, 1, 13, 13)"),
-    "logits": ({}, "logits.onnx: expected finite boxes with scores from 0 to 1, found scores from 0 to 10;"),
+    "logits": (
+        {},
+        "logits.onnx: expected finite boxes with scores from 0 to 1, found scores from -",
+        " to 10;",
+    ),
+    "oriented": (
+        {},
+        "found scores from -0.5 to 1, as of oriented boxes with their angle; use a network of upright",
+    ),
+    "middles": (
+        {"layout": None},
+        "middles.onnx: expected boxes whose layout their numbers show, found ",
+        "--layout",
+    ),
     "v5": ({"confidence": 0.0}, "confidence: expected "),
 }
 
@@ -159,7 +174,7 @@ def squares_of(rig, index):
     return [square(128, column, row) for column, row in places.tolist()]
 
 
-def test_detect_writes_a_file_per_camera(models, flight_folder, run_psotrack, tmp_path):
+def test_detect_writes_a_file_per_camera(models, flight_folder, run_psotrack, tmp_path, caplog):
     folder, rig = flight_folder
     found = detect_drones(detector(models, "v5"), "3", probe(folder / "3.avi"))
     frames = [0, *range(2, 12)]
@@ -178,6 +193,11 @@ def test_detect_writes_a_file_per_camera(models, flight_folder, run_psotrack, tm
     np.testing.assert_allclose(written.xyxy, found.xyxy, atol=1e-4)
     some = detect("--out", tmp_path / "b", "--cameras", "3", "--frames", 3, "--json", "-")
     assert json.loads(some.out) == {"out": str(tmp_path / "b"), "frames": 3, "detections": {"3": 2}}
+    caplog.clear()
+    detect("--out", tmp_path / "c", "--confidence", 1.0, "--frames", 3)
+    assert "not a box in the whole recording" in caplog.text
+    run_psotrack("track", folder, "--method", "projection-lines", "--detections", tmp_path / "c")
+    assert "no camera has a detection in the whole recording" in caplog.text
 
 
 def test_track_makes_detections_and_keeps_them(models, flight_folder, run_psotrack, tmp_path, monkeypatch):

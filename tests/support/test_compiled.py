@@ -1,5 +1,6 @@
-"""Compile cache on disk: entries are reused, damaged entries are replaced, and an unusable folder is no error."""
+"""Compiled programs: what users set for programs of their own, and the cache on disk, which is repaired."""
 
+import os
 import threading
 import time
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 from helpers import environment_without_jax_settings
+from worlds import two_flights
 
 from psotrack.support import compiled, drop_programs_if_many, keep_compiled, measured_compiling
 
@@ -37,6 +39,22 @@ for entry in entries:
         use()
     print(len(entry.read_bytes()) / len(whole))
 """
+#: Runs psotrack with the words of each argument.
+COMMANDS = """
+import sys
+from psotrack.cli import main
+for words in sys.argv[1:]:
+    sys.argv = ["psotrack", *words.split()]
+    main()
+"""
+#: What researchers set for programs of their own.
+JAX_SETTINGS = {
+    "JAX_ENABLE_X64": "1",
+    "JAX_DEBUG_NANS": "1",
+    "JAX_DEBUG_INFS": "1",
+    "JAX_DISABLE_JIT": "1",
+    "JAX_NUMPY_RANK_PROMOTION": "raise",
+}
 #: What the program prints: 2 sin(0.5).
 RESULT = "0.958851"
 
@@ -109,3 +127,30 @@ def test_threads_that_compile_at_the_same_time_count_once() -> None:
     # Nobody measures any longer.
     compile_something()
     assert compile_s() == measured_s
+
+
+@pytest.mark.slow
+def test_settings_of_jax_for_other_programs_change_no_result(start_python, tmp_path_factory, tmp_path):
+    """Neither of both trackers together, of smoothing and clocks, of tracking step by step, nor of drawn boxes."""
+    flight = two_flights(tmp_path_factory) / "flight"
+    swarm = "--particles 8 --iterations 4 --drone-size 0.4,0.4,0.2"
+
+    def done(name: str, **variables: str) -> tuple[int, str, Path]:
+        folder = tmp_path / name
+        words = [
+            f"track {flight} --out {folder}/fused.csv --method fused --detections blobs --smooth --clocks auto {swarm}",
+            f"track {flight} --out {folder}/causal.csv --causal --most-drones 2 {swarm}",
+            f"overlay {flight.parent}/tracks.csv {flight} --out {folder}/shown.mp4 --frames 2",
+        ]
+        process = start_python("-c", COMMANDS, *words, env={**os.environ, **variables})
+        said = process.communicate()[1]
+        return process.returncode, said, folder
+
+    (code, said, plain), (again, said_again, other) = done("plain"), done("other", **JAX_SETTINGS)
+    assert (code, again) == (0, 0), f"{said}{said_again}"
+    for name in ("fused.csv", "causal.csv"):
+        assert (plain / name).read_bytes() == (other / name).read_bytes()
+    code, said, _ = done("tpu", JAX_PLATFORMS="tpu")
+    assert code == 2
+    assert said.startswith("psotrack: JAX_PLATFORMS: expected devices that JAX finds, found ")
+    assert said.count("\n") == 1

@@ -5,7 +5,7 @@ from .detector import (
     find_detector,
     stored_detections,
 )
-from .settings import DetectorSettings, LabelSettings
+from .settings import DetectorSettings, LabelSettings, Layout
 from .training_data import DATA_SET, box_corners, label_boxes, write_data_set
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Detector",
     "DetectorSettings",
     "LabelSettings",
+    "Layout",
     "OnnxDetector",
     "box_corners",
     "detect_drones",

@@ -1,13 +1,16 @@
 """Detection of drones by a neural network: a YOLO model in ONNX format, run by OpenCV on every frame of a video.
 
-Frames are scaled into the network's square input with grey borders (letterbox), RGB in [0, 1]. The shape of the output
-identifies the layout:
+Frames are scaled into the network's square input with grey borders (letterbox), RGB in [0, 1]. Shape and content of the
+output identify its layout:
 
-- v5 to v7: (1, boxes, 5 + classes): middle and size of the box, confidence of any object, confidence of each class;
-- v8, v9, v11: (1, 4 + classes, boxes): middle and size of the box, confidence of each class;
-- v10: (1, 300, 6): corners of the box, confidence, class.
+- "v5", of v5 to v7: (1, boxes, 5 + classes): middle and size, confidence of any object, confidence of each class;
+- "v8", of v8, v9 and v11: (1, 4 + classes, boxes), or turned: middle and size, confidence of each class;
+- "corners", of v10 and of networks with a suppression of their own: (1, boxes, 6): corners, and the confidence and the
+  number of the class in either order; rows without a box are 0;
+- "middles": the same with middle and size instead of corners, which only the settings can say.
 
-All boxes are in pixels of the input. Objects of all classes count as drones: use a network that was trained on drones.
+Boxes are in pixels of the input, or in shares of its side. Objects of all classes count as drones: use a network that
+was trained on drones.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.foreground.detection.settings import DetectorSettings
+from psotrack.foreground.detection.settings import DetectorSettings, Layout
 from psotrack.recordings import (
     Detections,
     Recording,
@@ -52,10 +55,11 @@ FoundBoxes = tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]
 
 #: Colour of YOLO's own letterbox borders.
 _GREY = (114, 114, 114)
-#: Shape of the output of v10, after its own selection of boxes; outputs of other layouts never have this shape.
-_V10_SHAPE = (300, 6)
 #: Largest excess of a score over 1 that is ignored as rounding.
 _ROUNDING = 1e-3
+#: Coordinates up to this number are shares of the input's side: nothing that is found is within two pixels of a corner.
+_LARGEST_SHARE = 2.0
+_SAY_LAYOUT = "say which with --layout (--detector-layout of track)"
 
 
 @runtime_checkable
@@ -128,6 +132,8 @@ class OnnxDetector:
             self._network.setInput(cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True))
             output = self._network.forward()
         in_square, score = self._decode(np.asarray(output, np.float64))
+        if np.abs(in_square[score >= self.settings.confidence]).max(initial=0.0) <= _LARGEST_SHARE:
+            in_square *= size
         xyxy = (in_square - np.tile(start, 2)) / np.tile(scale, 2)
         xyxy = np.clip(xyxy, 0, np.tile([bgr.shape[1], bgr.shape[0]], 2))
         xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
@@ -139,27 +145,56 @@ class OnnxDetector:
         return xyxy[index], score[index]
 
     def _decode(self, output: Float[np.ndarray, "..."]) -> FoundBoxes:
-        """Boxes (xyxy in pixels of the input) and their scores from the network's output."""
+        """Boxes (xyxy in pixels of the input, or in shares of its side) and their scores from the network's output."""
         table = output[0] if output.ndim == 3 and len(output) == 1 else np.empty((0, 0))
-        rows, columns = table.shape
-        if (rows, columns) == _V10_SHAPE:
-            score = table[:, 4]
-        elif rows > columns > 5:
-            score = table[:, 4] * table[:, 5:].max(axis=1)
-        elif columns > rows > 4:
+        layout = self.settings.layout or self._layout_of(table)
+        if layout == "v8" and len(table) < table.shape[1]:
             table = table.T
-            score = table[:, 4:].max(axis=1)
+        columns = table.shape[1]
+        if layout is None or columns < 5 or (layout == "v5" and columns < 6):
+            expected = f"an output in the layout {layout}" if layout else "an output in a layout of YOLO"
+            raise InputError(self.model, expected=expected, found=f"{output.shape}")
+        if layout in ("corners", "middles"):
+            # The numbers of classes are whole, their confidences are not.
+            order = 5 if _are_whole(table[:, 4]) and not _are_whole(table[:, 5]) else 4
+            scores = table[:, [order]]
         else:
-            raise InputError(self.model, expected="an output in a layout of YOLO", found=f"{output.shape}")
-        if not (np.isfinite(table).all() and score.min() >= 0 and score.max() <= 1 + _ROUNDING):
-            found = f"scores from {score.min():.3g} to {score.max():.3g}"
+            scores = table[:, 4:]
+        in_range = (scores >= 0).all(axis=0) & (scores <= 1 + _ROUNDING).all(axis=0)
+        if not (np.isfinite(table).all() and in_range.all()):
+            found = f"scores from {scores.min():.3g} to {scores.max():.3g}"
             remedy = "export the network with its last layers, in YOLO's own layout"
+            if in_range[:-1].all() and np.abs(scores[:, -1]).max() <= np.pi:
+                found, remedy = (
+                    f"{found}, as of oriented boxes with their angle",
+                    "use a network of upright boxes",
+                )
             expected = "finite boxes with scores from 0 to 1"
             raise InputError(self.model, expected=expected, found=found, remedy=remedy)
-        if (rows, columns) == _V10_SHAPE:
+        score = scores[:, 1:].max(axis=1) * scores[:, 0] if layout == "v5" else scores.max(axis=1)
+        if layout == "corners":
             return table[:, :4], score
         middle, half = table[:, :2], table[:, 2:4] / 2
         return np.hstack([middle - half, middle + half]), score
+
+    def _layout_of(self, table: Float[np.ndarray, "rows columns"]) -> Layout | None:
+        """The layout of an output, None for none that is known.
+
+        Raises:
+            InputError: the output may have more than one layout.
+        """
+        rows, columns = table.shape
+        if columns == 6 and (_are_whole(table[:, 4]) or _are_whole(table[:, 5])):
+            if (table[:, 2:4] >= table[:, :2]).all():
+                return "corners"
+            # The only class of v5 may have the confidence 1 everywhere.
+            if len(np.unique(table[:, 5])) > 1:
+                expected = "boxes whose layout their numbers show"
+                found = "whole numbers of classes, but no corners"
+                raise InputError(self.model, expected=expected, found=found, remedy=_SAY_LAYOUT)
+        if rows > columns:
+            return "v5" if columns > 5 else "v8" if columns == 5 else None
+        return "v8" if columns > rows > 4 else None
 
     @contextlib.contextmanager
     def _opencv_errors(self, expected: str, remedy: str = "") -> Iterator[None]:
@@ -170,6 +205,10 @@ class OnnxDetector:
         except cv2.error as error:
             found = f"one that it cannot use ({' '.join((error.err or str(error)).split())})"
             raise InputError(self.model, expected=expected, found=found, remedy=remedy) from error
+
+
+def _are_whole(numbers: Float[np.ndarray, "rows"]) -> bool:
+    return bool((numbers == np.round(numbers)).all())
 
 
 #: Memory, bytes, and time, seconds, that a network may take for one image.

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from psotrack.support import Positive, Share, check_types
+
+#: Layouts of a network's output (see `psotrack.foreground.detection.detector`).
+Layout = Literal["v5", "v8", "corners", "middles"]
 
 
 class DetectorSettings(msgspec.Struct, frozen=True):
@@ -18,6 +21,9 @@ class DetectorSettings(msgspec.Struct, frozen=True):
         nms: intersection over union above which two boxes are taken for one drone, in (0, 1]; the one with the higher
             score is kept.
         size: side of the network's square input, in pixels.
+        layout: layout of the network's output: "v5", middle and size, confidence of any object and of each class; "v8",
+            the same without that of any object; "corners" or "middles", a box, its confidence and class. None: told by
+            the output's shape and content.
 
     Raises:
         SettingsError: a value is out of range.
@@ -26,6 +32,7 @@ class DetectorSettings(msgspec.Struct, frozen=True):
     confidence: Annotated[float, Meta(gt=0, le=1)] = 0.25
     nms: Annotated[float, Meta(gt=0, le=1)] = 0.45
     size: Annotated[int, Meta(ge=1)] = 640
+    layout: Layout | None = None
 
     def __post_init__(self) -> None:
         check_types(self)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
-import jax
 import numpy as np
 
+from psotrack.support import as_written
 from psotrack.tracking.identity.encounters import (
     Encounter,
     FollowedEncounter,
@@ -58,7 +58,7 @@ def resolve(measured: Measurements, motion: MotionParams, encounter_m: float) ->
         density = _AGILITY * np.asarray(motion.jerk_density_m2_s5)[list(pair)]
         of_pair = replace(motion, jerk_density_m2_s5=density)
         known = Measurements(measured.time_s, *by_drone)
-        with jax.enable_x64(True):
+        with as_written(float64=True):
             return follow(pair, int(near.argmax()), known, of_pair, encounter_m)
 
     ambiguity = np.zeros((num_frames, len(pairs)))

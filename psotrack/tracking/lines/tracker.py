@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera
 from psotrack.settings import TrackSettings
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, as_written, no_progress
 from psotrack.tracking.births import (
     NEW,
     NO_DRONE,
@@ -70,8 +70,7 @@ def track_detections(
             drones.
         report: reports progress, in frames.
     """
-    # float64 is switched on in this block only.
-    with jax.enable_x64(True):
+    with as_written(float64=True):
         tracker = _Tracker(cameras, sightings, settings, fps, bounds_m)
         if known is not None:
             tracker.start_known(*known)

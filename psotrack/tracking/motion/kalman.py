@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.settings import MotionSettings
+from psotrack.support import as_written
 from psotrack.support.array_types import Array, Positions
 
 #: The chi-square distribution with 3 degrees of freedom is below this with probability 0.999.
@@ -64,6 +65,7 @@ class MotionParams:
     error_time_s: Float[Array, ""]
 
 
+@as_written()
 def motion_params(settings: MotionSettings, num_drones: int) -> MotionParams:
     """Parameters of the motion model for `num_drones` drones, as float32 arrays."""
     return MotionParams(

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
 from psotrack.geometry.estimation import backward_step
+from psotrack.support import as_written
 from psotrack.support.array_types import Array
 from psotrack.tracking.motion import kalman
 from psotrack.tracking.motion.kalman import MotionParams, MotionState
@@ -111,15 +112,14 @@ def filter_measurements(measured: Measurements, params: MotionParams) -> Smoothe
 
 def last_state(measured: Measurements, params: MotionParams) -> MotionState:
     """The filter's state after the last frame. A drone that was never measured has a state without meaning."""
-    with jax.enable_x64(True):
+    with as_written(float64=True):
         return jax.tree.map(np.asarray, _last_state(*_in_float64(measured, params)))
 
 
 def _estimated(program: Callable, measured: Measurements, params: MotionParams) -> Smoothed:
     """What a compiled program estimates from measurements, on the host."""
     measured.check()
-    # The context manager limits float64 to this call.
-    with jax.enable_x64(True):
+    with as_written(float64=True):
         states = Smoothed(*map(np.array, program(*_in_float64(measured, params))))
     not_begun = ~np.logical_or.accumulate(measured.was_measured, axis=0)
     for value in vars(states).values():
@@ -143,7 +143,7 @@ def estimate_jerk_density(measured: Measurements, params: MotionParams) -> Float
     drones = np.arange(len(expected))
 
     decades = np.tile(_JERK_DECADES[:, None], len(drones))
-    with jax.enable_x64(True):
+    with as_written(float64=True):
         found = np.asarray(_log_likelihoods(*_in_float64(measured, params), 10.0**decades))
     score = found - ((decades - expected) / _JERK_PRIOR_DECADES) ** 2 / 2
     best = np.clip(score.argmax(axis=0), 1, len(decades) - 2)

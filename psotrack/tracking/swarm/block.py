@@ -21,7 +21,7 @@ from jaxtyping import Int, UInt8
 
 from psotrack.foreground.silhouettes import Exposures
 from psotrack.geometry import Camera, Rig
-from psotrack.support import processors
+from psotrack.support import as_written, processors
 from psotrack.tracking.births import FrameBlobs
 from psotrack.tracking.swarm import tracker
 from psotrack.tracking.swarm.patches import make_pyramid
@@ -88,6 +88,7 @@ class Block:
         return FrameBlobs.of(self.coverage, self._setting.reduction, self._setting.borders, self.exposures)
 
 
+@as_written()
 def make_block(
     setting: Setting,
     instant: Int[np.ndarray, "frames"],
@@ -179,6 +180,7 @@ class Engine:
                 for run in range(len(jobs))
             ]
 
+        @as_written()  # for the threads
         def one(job: Job) -> tuple[Slots, Rows]:
             arguments = job.slots, block.frames, job.starts, self._cameras, job.params
             return jax.block_until_ready(_one_run(*arguments, job.program))

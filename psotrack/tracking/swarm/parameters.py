@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
-from psotrack.support import make_plugin
+from psotrack.support import as_written, make_plugin
 from psotrack.tracking.births import FlightLimits
 from psotrack.tracking.motion import motion_params
 from psotrack.tracking.swarm import tracker
@@ -33,6 +33,7 @@ class TrackerSettings:
     camera_score: Score
 
 
+@as_written()
 def tracker_settings(
     settings: TrackSettings, *, search: Search | None = None, score: Score | None = None
 ) -> TrackerSettings:

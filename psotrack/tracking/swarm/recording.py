@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, as_written, no_progress
 from psotrack.tracking.births import TrackCandidate, state_at
 from psotrack.tracking.swarm.block import BLOCK_FRAMES, Block, Engine, Setting, make_block
 from psotrack.tracking.swarm.run import RunInputs, Start, SwarmRun
@@ -57,6 +57,7 @@ class _Progress:
     arrivals: list[Arrival] = field(default_factory=list)
 
 
+@as_written()
 def track_silhouettes(
     rig: Rig,
     silhouettes: Silhouettes,

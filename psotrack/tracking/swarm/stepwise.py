@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 
 from psotrack.foreground.silhouettes import Exposures, border_cells, foreground_is_everywhere
 from psotrack.geometry import Rig
+from psotrack.support import as_written
 from psotrack.tracking.births import TrackCandidate, state_at
 from psotrack.tracking.swarm.block import Block, Engine, Setting, make_block
 from psotrack.tracking.swarm.parameters import TrackerSettings
@@ -42,6 +43,7 @@ class StepwiseTracker:
         most_drones: largest number of drones at one time.
     """
 
+    @as_written()
     def __init__(
         self,
         rig: Rig,
@@ -68,6 +70,7 @@ class StepwiseTracker:
         self._was_full = False
         self._latest: tuple[Block, Rows] | None = None
 
+    @as_written()
     def compile(self) -> None:
         """Compile the program for all numbers of drones that may come, so that no frame has to wait for it."""
         coverage = np.zeros((1, len(self._setting.rig), *self._shape), np.uint8)
@@ -82,6 +85,7 @@ class StepwiseTracker:
             self._engine.track([self._run.job(block, [])], block)
         self._run.resize(0)
 
+    @as_written()
     def step(
         self,
         instant: int,
@@ -119,6 +123,7 @@ class StepwiseTracker:
         self._latest = block, rows
         return self._of_known(rows, instant, time_s)
 
+    @as_written()
     def look_ahead(self) -> None:
         """What need not be done before the rows of a frame are passed on: births, and drones that are forgotten.
 
