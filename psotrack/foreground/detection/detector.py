@@ -160,7 +160,7 @@ class OnnxDetector:
             scores = table[:, [order]]
         else:
             scores = table[:, 4:]
-        in_range = (scores >= 0).all(axis=0) & (scores <= 1 + _ROUNDING).all(axis=0)
+        in_range = np.all((scores >= 0) & (scores <= 1 + _ROUNDING), axis=0)
         if not (np.isfinite(table).all() and in_range.all()):
             found = f"scores from {scores.min():.3g} to {scores.max():.3g}"
             remedy = "export the network with its last layers, in YOLO's own layout"
