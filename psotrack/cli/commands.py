@@ -37,7 +37,6 @@ from msgspec.inspect import (
 
 from psotrack.cli.output import Output
 from psotrack.cli.types import DISTANCE, NAMES, RUNNING, SIZE, numbers
-from psotrack.errors import InputError
 
 #: Ends of the names of fields that state a unit; options state it in their help.
 _UNITS = re.compile(r"_(m|mm|s|m_s|hz|deg|px|mb|m_s2|m2_s5)$")
@@ -296,19 +295,7 @@ def command(
             with of_output.take(Output, values).opened() as output:
                 taken = {key: group.take(record, values) for key, (record, group) in groups.items()}
                 plain = {key: value for key, value in values.items() if key in hints}
-                try:
-                    function(output, **plain | taken)
-                except InputError as error:
-                    from psotrack.recordings import TruncatedVideoError
-
-                    if (
-                        "num_frames" in values
-                        and isinstance(error, TruncatedVideoError)
-                        and error.num_instants
-                    ):
-                        way_on = f"--frames {error.num_instants} uses the time before"
-                        raise error.with_way_on(way_on) from None
-                    raise
+                function(output, **plain | taken)
                 for key, (_, group) in groups.items():
                     group.finish(taken[key], values)
 

@@ -97,12 +97,10 @@ def init(
 
 def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
     """Show a recording, and check its files."""
-    from psotrack.recordings import check_end, inventory_table
+    from psotrack.recordings import inventory_table
     from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(sequence, bodies=bodies)
-    for video in recording.videos.values():
-        check_end(video)
     recording.check_detections(recording.detections)
     if recording.marker_corners is not None:
         from psotrack.inside_out import read_marker_table

@@ -28,9 +28,10 @@ from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.recordings import (
     IMAGE_SUFFIXES,
     VideoInfo,
+    frame_times,
     is_picture_folder,
     open_pictures,
-    probe,
+    open_video,
     read_frames,
     silence_opencv,
 )
@@ -130,21 +131,23 @@ def open_source(source: Path | str, *, fps: float | None = None, live: bool = Fa
                 remedy="add it in frames per second, such as --fps 25",
             )
         video = open_pictures(path, fps)
-        return _recorded(video, video.fps)
+        return _recorded(video)
     if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
         remedy = "name the images' folder, and pass --fps"
         raise InputError(path, expected="a video, or a folder of images", found="one image", remedy=remedy)
-    video = probe(path)
-    return _recorded(video, fps or video.fps)
+    video = open_video(path, fps)
+    return _recorded(video)
 
 
-def _recorded(video: VideoInfo, fps: float) -> FrameSource:
-    """The frames of a file or a folder, at `fps` frames per second."""
+def _recorded(video: VideoInfo) -> FrameSource:
+    """The frames of a file or a folder, at their times."""
+    times_s = frame_times(video).time_s.tolist()
 
     def frames() -> Iterator[Frame]:
-        return (Frame(number, number / fps, bgr) for number, bgr in enumerate(read_frames(video)))
+        shown = zip(times_s, read_frames(video), strict=True)
+        return (Frame(number, time_s, bgr) for number, (time_s, bgr) in enumerate(shown))
 
-    return FrameSource(str(video.path), video.image_size_wh, video.num_frames, frames, fps=fps)
+    return FrameSource(str(video.path), video.image_size_wh, video.num_frames, frames, fps=video.fps)
 
 
 def _stream(address: str, fps: float | None, live: bool) -> FrameSource:

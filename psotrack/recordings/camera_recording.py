@@ -15,7 +15,7 @@ from psotrack.geometry import Camera
 from psotrack.recordings.detections import read_detections
 from psotrack.recordings.stored_silhouettes import StoredSilhouettes
 from psotrack.recordings.timing import FrameTimes
-from psotrack.recordings.video import VideoInfo
+from psotrack.recordings.video import VideoInfo, frame_times
 from psotrack.support import short_repr
 
 _logger = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class CameraRecording:
         camera: its lens and its place; None where one of them is not known.
         video: its video, or None.
         stream: address of its stream, or "device" and the number or path of its device; such a camera has no video.
-        times: times of its frames. A camera with a video and without times begins at time 0 and has the video's rate;
+        times: times of its frames. A camera with a video and without times has those of the video's file;
             a camera of which nothing is known to be in time has none.
         line_time_s: time from the exposure of one row to that of the next row, seconds; 0 of a global shutter.
         detections: file of its 2D detections, or None.
@@ -55,7 +55,7 @@ class CameraRecording:
         if self.video is None:
             return
         count = self.video.num_frames
-        times = FrameTimes(count, self.video.fps) if self.times is None else self.times
+        times = frame_times(self.video) if self.times is None else self.times
         if times.listed_s is None or count < times.num_frames:
             times = replace(times.cut(count), num_frames=count)
         object.__setattr__(self, "times", times)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,7 +27,7 @@ def open_video(path: Path | str, fps: float | None = None) -> VideoInfo:
 
     Args:
         path: path of the file or the folder.
-        fps: frames per second; needed for pictures, which do not state it. For a video file, instead of its own rate.
+        fps: frames per second; needed for pictures, which do not state it. For a video file, instead of its own times.
 
     Raises:
         InputError: there is no video at the path, the folder has no pictures, or the rate of pictures is not given.
@@ -48,7 +47,7 @@ def open_video(path: Path | str, fps: float | None = None) -> VideoInfo:
     if fps is None:
         return video
     check_positive("fps", fps)
-    return replace(video, fps=fps)
+    return video.at_rate(fps)
 
 
 def open_pictures(folder: Path, fps: float | None) -> VideoInfo:

@@ -1,35 +1,53 @@
 """Reading of videos.
 
-FFmpeg, inside OpenCV, decodes. FFmpeg trusts the header, and drops frames that it cannot decode; in this module either
-is an error that names the file. Frame rates are as exact as in the container: 29 instead of 29.97 would lose a second
-in half a minute.
+FFmpeg, inside OpenCV, decodes. What a header says of the number of frames and of their rate is an estimate in many
+containers, so that the packets of a file, which hold one encoded frame each, are counted and their times are read.
+Where the first or the last of them is no frame that FFmpeg shows, all frames are decoded and counted.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import math
 import os
 import shlex
+from bisect import bisect_left
+from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.recordings.image_files import check_pixels, depth_of, read_image
 from psotrack.recordings.opencv_messages import silence_opencv
-from psotrack.recordings.timing import MOST_INSTANTS
+from psotrack.recordings.timing import MOST_INSTANTS, FrameTimes
 from psotrack.support import digest_file, digest_record
 
+_logger = logging.getLogger(__name__)
 #: Largest number of images of which the depth is read.
 _READ_IMAGES = 5
 #: To reach a frame, OpenCV decodes from the last key frame that is at least this number of frames before it.
 _SEEK_BEFORE = 17
+#: Times nearer than this are one time: containers round to a millisecond.
+_SAME_S = 2e-3
+#: Time before the end from which on frames are decoded to find the last one, seconds.
+_END_S = 1.0
+#: Number of packets in a row that cannot be decoded from which on a video is at its end: ten seconds at 30 Hz.
+_FAILURES = 300
+#: Sound in containers comes in blocks, of 46 ms at most in AAC of 22 kHz, and often ends after the pictures.
+_SOUND_S = 0.05
+#: Largest deviation of regular frames from their rate: in intervals, and half a tick of Matroska's clock, seconds.
+_JITTER, _TICK_S = 0.1, 0.51e-3
+#: Largest share by which the rate of a header differs from that of times which are rounded to a clock's ticks.
+_SAME_RATE = 1e-3
+#: Intervals between two frames from which on there is a gap; largest number of gaps that a message names.
+_GAP, _SHOWN = 1.5, 3
 #: Number of frames from which on a seek is faster than decoding: the usual distance of key frames.
 _WORTH_SEEKING = 250
 
@@ -40,7 +58,7 @@ class VideoInfo:
 
     Attributes:
         path: path of the file; of the images' folder where the frames are image files.
-        num_frames: number of frames according to the header, above 0; reduce it with `dataclasses.replace` to use only
+        num_frames: number of frames, above 0; reduce it with `dataclasses.replace` to use only
             the first frames.
         fps: frames per second, as exact as in the container.
         image_size_wh: width and height of the frames in pixels.
@@ -48,6 +66,10 @@ class VideoInfo:
         depth_bits: number of bits that the values of images of 16 bits use; frames have the upper 8 of them.
         is_finished: False for a video whose program was stopped before it wrote the number of frames into the header,
             and the index with which frames are sought.
+        is_timed: whether each frame that is decoded has the time of its packet, so that one that cannot be decoded is
+            noticed; otherwise frames are only counted.
+        times_s: time of each frame as the container states it, seconds from the start of the file, increasing; empty
+            where frames come at `fps` from time 0.
     """
 
     path: Path
@@ -57,50 +79,152 @@ class VideoInfo:
     images: tuple[Path, ...] = ()
     depth_bits: int = 16
     is_finished: bool = True
+    is_timed: bool = field(default=False, compare=False)
+    times_s: tuple[float, ...] = ()
+
+    def at_rate(self, fps: float) -> VideoInfo:
+        """The same frames at a rate that somebody states instead of the file."""
+        return replace(self, fps=fps, times_s=(), is_timed=False)
 
 
 def probe(path: Path | str) -> VideoInfo:
-    """Read the header of a video. No frame is decoded, so that only `read_frames` notices a file that is cut short.
+    """Count the frames of a video, and read their times.
 
-    The frames of a video that was not finished are counted. Its last frame is not used, because it may be incomplete.
+    Packets are read without decoding, which is as fast as reading the file; some frames at both ends are decoded. The
+    frames of a video that was not finished are counted without its last frame, because it may be incomplete.
 
     Raises:
-        InputError: the file does not exist, is empty, is not a video, or has no frames.
+        InputError: the file does not exist, is empty, is not a video, has no frames, or none that can be decoded.
     """
     path = Path(path)
-    with open_capture(path) as capture:
-        num_frames = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    with open_capture(path) as capture, silence_opencv():
+        stated = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         fps = capture.get(cv2.CAP_PROP_FPS)
+        codec = round(capture.get(cv2.CAP_PROP_FOURCC))
         width = round(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         height = round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-    check_pixels(path, width, height)
-    is_finished = num_frames >= 1
+        check_pixels(path, width, height)
+        times_s = packet_times(path)
+        if not times_s:
+            raise InputError(path, expected="a video with frames", found="no frames")
+        ends_s = _end_times(capture, times_s[-1])
+    if not ends_s:
+        raise _undecodable(path, len(times_s), codec)
+    is_finished = stated >= 1
+    is_timed = np.allclose(ends_s, [times_s[0], times_s[-1]], rtol=0, atol=_SAME_S)
     if not is_finished:
-        num_frames = count_packets(path) - 1
-    if num_frames < 1:
-        raise InputError(path, expected="a video with frames", found="no frames")
-    if num_frames > MOST_INSTANTS:
-        expected = f"a video of at most {MOST_INSTANTS} frames"
-        raise InputError(path, expected=expected, found=f"{num_frames} in its header")
-    if not (math.isfinite(fps) and fps > 0):
-        raise InputError(path, expected="a video with a frame rate", found=f"{fps:g} frames per second")
-    return VideoInfo(path, num_frames, fps, (width, height), is_finished=is_finished)
+        times_s = times_s[:-1]
+    elif not is_timed:
+        times_s, is_timed = _decoded_times(path, times_s)
+    if not 1 <= len(times_s) <= MOST_INSTANTS:
+        expected = f"a video of 1 to {MOST_INSTANTS} frames"
+        raise InputError(path, expected=expected, found=f"{len(times_s)}")
+    video = VideoInfo(path, len(times_s), fps, (width, height), is_finished=is_finished, is_timed=is_timed)
+    video = _timed(video, np.array(times_s))
+    end_s = video.times_s[-1] + 1 / video.fps if video.times_s else video.num_frames / video.fps
+    if is_finished and fps > 0 and stated / fps - end_s > 1 / fps + _SOUND_S:
+        _logger.warning(
+            "%s: its header says %d frames until %.2f s, and the %d that can be decoded end at %.2f s: is it cut "
+            "short? Where it was cut without encoding, or its sound is longer, nothing is missing",
+            path, stated, stated / fps, video.num_frames, end_s,
+        )  # fmt: skip
+    return video
 
 
-def check_end(video: VideoInfo) -> None:
-    """Raise `InputError` if a video has fewer frames than its header says, or its last image is no frame of it.
+def _undecodable(path: Path, num_frames: int, codec: int) -> InputError:
+    """Error of a video that FFmpeg opens, and of which it decodes nothing."""
+    name = codec.to_bytes(4, "little").decode("latin-1")
+    new = shlex.quote(f"{path.stem}_h264.mp4")
+    return InputError(
+        path,
+        expected="a video that can be decoded",
+        found=f"{num_frames} frames of the codec {name if name.isprintable() else codec}, of which none can be",
+        remedy=f"if the file is whole, `ffmpeg -i {shlex.quote(path.name)} -c:v libx264 -crf 10 {new}` makes one",
+    )
 
-    The last frame is sought; only where it cannot be reached, the encoded frames are counted.
+
+def packet_times(path: Path) -> list[float]:
+    """Times of the encoded frames in a file, seconds, ascending; found without decoding, in microseconds per frame.
+
+    A file that cannot be opened has none.
     """
-    if video.images:
-        path = video.images[video.num_frames - 1]
-        _check_size(path, video, read_image(path))
-        return
-    with open_capture(video.path) as capture, silence_opencv():
-        capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
-        reached = capture.grab()
-    if not reached and (count := count_packets(video.path)) < video.num_frames:
-        raise TruncatedVideoError(video, count)
+    with contextlib.suppress(InputError), open_capture(path) as capture:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        return sorted(_grabbed_times(capture))
+    return []
+
+
+def _grab(capture: cv2.VideoCapture) -> bool:
+    """Go on to the next frame that can be decoded; False at the end."""
+    return any(capture.grab() for _ in range(_FAILURES))
+
+
+def _grabbed_times(capture: cv2.VideoCapture) -> Iterator[float]:
+    """Times of the frames, or of the packets, from here to the end, seconds."""
+    while _grab(capture):
+        yield capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+
+
+def _end_times(capture: cv2.VideoCapture, last_s: float) -> list[float]:
+    """Times of the first and the last frame that can be decoded, seconds; empty if the first cannot be.
+
+    The last frame is reached by a seek; NaN is its time where the seek fails.
+    """
+    first_s = next(_grabbed_times(capture), None)
+    if first_s is None:
+        return []
+    capture.set(cv2.CAP_PROP_POS_MSEC, 1e3 * max(0.0, last_s - _END_S))
+    return [first_s, *deque(_grabbed_times(capture), maxlen=1)] if last_s > first_s else [first_s, first_s]
+
+
+def _decoded_times(path: Path, packets_s: list[float]) -> tuple[list[float], bool]:
+    """Times of all frames that can be decoded, seconds, and whether each frame comes with its time."""
+    with open_capture(path) as capture, silence_opencv():
+        times_s = list(_grabbed_times(capture))
+    # Some containers state no times, and frames that a codec has held back come without them.
+    is_timed = bool((np.diff(times_s) > 0).all())
+    return (packets_s if not is_timed and len(times_s) == len(packets_s) else times_s), is_timed
+
+
+def _timed(video: VideoInfo, times_s: Float[np.ndarray, "frames"]) -> VideoInfo:
+    """A video with the times of its frames, or with their rate where they come regularly."""
+    if len(times_s) < 2 or not (np.diff(times_s) > 0).all():
+        if not (math.isfinite(video.fps) and video.fps > 0):
+            found = f"{video.fps:g} frames per second"
+            raise InputError(video.path, expected="a video with a frame rate", found=found)
+        return replace(video, is_timed=False)
+    number, steps_s = np.arange(len(times_s)), np.diff(times_s)
+    # Gaps are no part of the rate; the median alone would be a whole number of the clock's ticks.
+    own_fps = 1 / float(steps_s[steps_s <= _GAP * np.median(steps_s)].mean())
+    for fps in (video.fps, own_fps):
+        if fps > 0 and (np.abs(times_s - number / fps) <= max(_JITTER / fps, _TICK_S)).all():
+            return replace(video, fps=fps)
+    fps = video.fps if abs(video.fps / own_fps - 1) < _SAME_RATE else own_fps
+    return replace(video, fps=fps, times_s=tuple(times_s.tolist()))
+
+
+def frame_times(video: VideoInfo, offset_s: float = 0.0) -> FrameTimes:
+    """Times of a video's frames; a warning says where they are not regular.
+
+    Args:
+        video: the video.
+        offset_s: time on the recording's clock at which the video begins, seconds.
+    """
+    if not video.times_s:
+        return FrameTimes(video.num_frames, video.fps, offset_s)
+    times_s = np.array(video.times_s[: video.num_frames])
+    gaps_s = np.diff(times_s, prepend=min(0.0, times_s[0]))
+    late = np.flatnonzero(gaps_s * video.fps > _GAP)
+    shown = ", ".join(f"{gaps_s[frame]:.3g} s before frame {frame}" for frame in late[:_SHOWN])
+    more = f" and {len(late) - _SHOWN} others" if len(late) > _SHOWN else ""
+    _logger.warning(
+        "%s: %s; the times that the file states for its frames are used",
+        video.path,
+        f"gap of {shown}{more}" if shown else f"frames at irregular times, not at {video.fps:g} Hz",
+    )
+    if len(times_s) < 2:
+        return FrameTimes(len(times_s), video.fps, offset_s + float(times_s[0]))
+    return replace(FrameTimes.listed(times_s + offset_s, video.path), fps=video.fps)
 
 
 def probe_images(images: Sequence[Path | str], fps: float) -> VideoInfo:
@@ -118,7 +242,9 @@ def probe_images(images: Sequence[Path | str], fps: float) -> VideoInfo:
     paths = tuple(map(Path, images))
     height, width, _ = read_image(paths[0]).shape
     read = paths[:: max(1, -(-len(paths) // _READ_IMAGES))]
-    return VideoInfo(paths[0].parent, len(paths), fps, (width, height), paths, depth_of(read))
+    video = VideoInfo(paths[0].parent, len(paths), fps, (width, height), paths, depth_of(read))
+    _check_size(paths[-1], video, read_image(paths[-1]))
+    return video
 
 
 def digest_video(video: VideoInfo) -> str:
@@ -137,7 +263,8 @@ def read_frames(
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
-    The codec must decode the frames in between, but they are not converted to BGR.
+    The codec must decode the frames in between, but they are not converted to BGR. A frame that cannot be decoded
+    shows the picture before.
 
     Args:
         video: the video.
@@ -156,19 +283,29 @@ def read_frames(
             _check_size(path, video, frame)
             yield frame
         return
-    place: UInt8[np.ndarray, "height width 3"] | None = None
+    frame: UInt8[np.ndarray, "height width 3"] | None = None
+    reached = -1
     with open_capture(video.path) as capture:
         for index in range(video.num_frames):
-            if not capture.grab():
-                raise TruncatedVideoError(video, index)
+            if reached < index:
+                if not _grab(capture):
+                    raise TruncatedVideoError(video, index)
+                reached = max(index, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
             if index % step:
                 continue
-            decoded, frame = capture.retrieve(place)
-            place = frame if into_one else None
-            if not decoded:
-                raise TruncatedVideoError(video, index)
-            _check_size(video.path, video, frame, f" in frame {index}")
+            if reached == index or frame is None:
+                decoded, frame = capture.retrieve(frame if into_one else None)
+                if not decoded:
+                    raise TruncatedVideoError(video, index)
+                _check_size(video.path, video, frame, f" in frame {index}")
             yield frame
+
+
+def _number_at(video: VideoInfo, time_s: float) -> int:
+    """Number of the frame that has a time, seconds; 0 where times say nothing."""
+    if not video.is_timed:
+        return 0
+    return bisect_left(video.times_s, time_s - _SAME_S) if video.times_s else round(time_s * video.fps)
 
 
 def read_frames_at(
@@ -195,14 +332,14 @@ def read_frames_at(
     following = 0
     with open_capture(video.path) as capture:
         for number in numbers:
-            if number - following > _WORTH_SEEKING and video.is_finished:
+            if number - following > _WORTH_SEEKING and video.is_finished and not video.times_s:
                 with silence_opencv():
                     if capture.set(cv2.CAP_PROP_POS_FRAMES, number):
                         following = round(capture.get(cv2.CAP_PROP_POS_FRAMES))
             while following <= number:
-                if not capture.grab():
+                if not _grab(capture):
                     raise TruncatedVideoError(video, following)
-                following += 1
+                following = 1 + max(following, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
             decoded, frame = capture.retrieve()
             if not decoded:
                 raise TruncatedVideoError(video, number)
@@ -282,51 +419,31 @@ def open_capture(path: Path) -> Iterator[cv2.VideoCapture]:
         # An absolute path, because FFmpeg reads the text before a colon as a protocol.
         capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG, threads)
     if not capture.isOpened():
-        raise InputError(path, expected="a video", found="a file that FFmpeg cannot open")
+        raise InputError(path, expected="a video", found="a file in which FFmpeg finds no pictures")
     try:
         yield capture
     finally:
         capture.release()
 
 
-def count_packets(path: Path) -> int:
-    """Number of encoded frames in a file, counted without decoding: a few microseconds per frame."""
-    with contextlib.suppress(InputError), open_capture(path) as capture:
-        capture.set(cv2.CAP_PROP_FORMAT, -1)
-        return sum(1 for _ in iter(capture.grab, False))
-    return 0
-
-
 class TruncatedVideoError(InputError):
-    """A video has fewer frames that can be decoded than its header says.
+    """A frame of a video cannot be decoded, although the file has it.
 
     Attributes:
         video: the video.
         num_readable: number of frames that can be decoded.
-        num_instants: number of instants of the recording in which these frames suffice.
     """
 
-    def __init__(
-        self, video: VideoInfo, num_readable: int, num_instants: int | None = None, way_on: str = ""
-    ) -> None:
+    def __init__(self, video: VideoInfo, num_readable: int) -> None:
         self.video, self.num_readable = video, num_readable
-        self.num_instants = num_readable if num_instants is None else num_instants
-        self._way_on = way_on
-        index = num_readable
-        if not way_on and num_readable:
-            whole = shlex.quote(video.path.name)
-            cut = shlex.quote(f"{video.path.stem}_cut{video.path.suffix}")
-            way_on = f"`ffmpeg -i {whole} -frames:v {num_readable} -c copy {cut}` keeps the frames before"
+        whole = shlex.quote(video.path.name)
+        new = shlex.quote(f"{video.path.stem}_h264.mp4")
         super().__init__(
             video.path,
             expected=f"{video.num_frames} frames",
-            found=f"that only {index} can be decoded (frame {index} is missing or broken)",
-            remedy="copy it again" + (f"; if only its end is missing, {way_on}" if way_on else ""),
+            found=f"that only {num_readable} can be decoded: the file is damaged",
+            remedy=f"copy it again; or `ffmpeg -i {whole} -c:v libx264 -crf 10 {new}` keeps what can be decoded",
         )
 
-    def with_way_on(self, way_on: str) -> TruncatedVideoError:
-        """The same error, which says in other words how to go on with the frames before the missing end."""
-        return TruncatedVideoError(self.video, self.num_readable, self.num_instants, way_on)
-
     def __reduce__(self) -> tuple[object, ...]:
-        return type(self), (self.video, self.num_readable, self.num_instants, self._way_on)
+        return type(self), (self.video, self.num_readable)

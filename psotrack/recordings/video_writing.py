@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
 from psotrack.recordings.opencv_messages import silence_opencv
-from psotrack.recordings.video import TruncatedVideoError, VideoInfo, count_packets, open_capture, probe
+from psotrack.recordings.video import TruncatedVideoError, VideoInfo, open_capture, packet_times, probe
 from psotrack.support import atomic_write
 
 #: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
@@ -171,6 +171,8 @@ def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
     videos = [probe(part) for part in parts]
     first = videos[0]
     for video in videos:
+        if not _has_its_end(video.path):
+            raise InputError(video.path, expected="a whole video", found="one that is cut short")
         if (video.fps, video.image_size_wh) != (first.fps, first.image_size_wh):
             raise InputError(
                 video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
@@ -192,7 +194,7 @@ def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
         OutputError: a frame or the index of frames is missing, or there is no frame.
     """
     # The header may count frames that are missing: count the frames themselves.
-    found = count_packets(temporary) if num_frames else 0
+    found = len(packet_times(temporary)) if num_frames else 0
     if found != num_frames or found == 0 or not _has_its_end(temporary):
         raise OutputError(
             path,

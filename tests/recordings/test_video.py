@@ -1,7 +1,6 @@
 """Videos and folders of pictures: exact frames, counts and rates, bad files, and a writer that never leaves a part."""
 
-import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,15 +10,15 @@ import numpy as np
 import pytest
 from helpers import assert_refused, content_of, files_up_to
 
-from psotrack.errors import InputError
 from psotrack.recordings import (
     VideoInfo,
     VideoWriter,
-    check_end,
+    frame_times,
     join_videos,
     open_video,
     probe,
     read_frames,
+    read_frames_at,
     read_near,
 )
 
@@ -60,7 +59,6 @@ def test_reading_gives_the_written_frames_and_their_rate(tmp_path, num_frames, f
     # frame fails.
     np.testing.assert_allclose([frame.mean() for frame in frames], levels, atol=6)
     assert frames[0].shape == (HEIGHT, WIDTH, 3)
-    check_end(video)
 
 
 def test_steps_and_leading_frames(tmp_path):
@@ -90,27 +88,99 @@ def test_a_name_that_looks_like_a_protocol(tmp_path, monkeypatch):
     assert probe(Path("cam:1 %02d.avi")).num_frames == 3
 
 
+def encoded(folder: Path, fourcc: str, num_frames: int) -> list[tuple[np.ndarray, float]]:
+    """Encoded frames of a moving picture, and whether each is a key frame; the first one is."""
+    kind = cv2.VideoWriter.fourcc(*fourcc)
+    writer = cv2.VideoWriter(str(folder / "source.avi"), kind, 30.0, (WIDTH, HEIGHT))
+    for frame in moving_picture(num_frames):
+        writer.write(frame)
+    writer.release()
+    source = cv2.VideoCapture(str(folder / "source.avi"), cv2.CAP_FFMPEG)
+    source.set(cv2.CAP_PROP_FORMAT, -1)
+    return [(source.read()[1], source.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME)) for _ in range(num_frames)]
+
+
+def packed(path: Path, frames: list[tuple[np.ndarray, float]], ticks: Iterable[int], fourcc: str) -> Path:
+    """A video of encoded frames at whole numbers of intervals of 1 / 30 s."""
+    raw = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1]
+    writer = cv2.VideoWriter(
+        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*fourcc), 30.0, (WIDTH, HEIGHT), raw
+    )
+    for tick, (packet, is_key) in zip(ticks, frames, strict=True):
+        writer.set(cv2.VIDEOWRITER_PROP_PTS, tick)
+        writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, is_key)
+        writer.write(packet)
+    writer.release()
+    return path
+
+
+def with_hidden(path: Path, num_frames: int) -> Path:
+    """An MP4 whose first frames are hidden, as `ffmpeg -c copy` cuts: its edit list begins in the middle."""
+    content = bytearray(path.read_bytes())
+    place = content.index(b"elst") + 16
+    at = content.index(b"mdhd")
+    clock_hz = int.from_bytes(content[at + 16 : at + 20], "big")
+    content[place : place + 4] = (num_frames * clock_hz // 30).to_bytes(4, "big")
+    path.write_bytes(content)
+    return path
+
+
+DROPPED = [*range(15), *range(24, 60)]
+
+
+def mp4(folder: Path, ticks: Sequence[int], fourcc: str = "MJPG") -> Path:
+    return packed(folder / "a.mp4", encoded(folder, "MJPG", len(ticks)), ticks, fourcc)
+
+
+TIMED = {
+    "nine frames lost": (
+        lambda folder: packed(folder / "a.mkv", encoded(folder, "XVID", 51), DROPPED, "XVID"),
+        DROPPED, 30.0, "a.mkv: gap of 0.333 s before frame 15; the times that the file states"),
+    "another rate": (lambda folder: mp4(folder, range(0, 120, 2)), range(60), 15.0, ""),
+    "hidden frames": (lambda folder: with_hidden(mp4(folder, range(60)), 12), range(48), 30.0,
+        "a.mp4: its header says 60 frames until 2.00 s, and the 48 that can be decoded end at 1.60 s"),
+    "no key frame": (
+        lambda folder: packed(
+            folder / "a.mkv", encoded(folder, "VP80", 12)[5:] + encoded(folder, "VP80", 53), range(60), "VP80"
+        ),
+        range(7, 60), 30.0, "a.mkv: gap of 0.233 s before frame 0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TIMED)
+def test_frames_that_can_be_decoded_and_their_times(case, tmp_path, caplog):
+    make, ticks, fps, said = TIMED[case]
+    video = probe(make(tmp_path))
+    assert video.fps == pytest.approx(fps)
+    np.testing.assert_allclose(frame_times(video).time_s, np.array(ticks) / fps, atol=1e-3)
+    assert len(list(read_frames(video))) == len(ticks)
+    assert [number for number, _ in read_frames_at(video, [3, len(ticks) - 1])] == [3, len(ticks) - 1]
+    assert said in caplog.text
+    assert bool(said) == bool(caplog.text)
+    # What a user states is used instead.
+    stated = open_video(video.path, 25.0)
+    np.testing.assert_array_equal(frame_times(stated).time_s, np.arange(len(ticks)) / 25.0)
+
+
+def test_a_codec_that_cannot_be_decoded_is_named(tmp_path):
+    path = mp4(tmp_path, range(9), "mp4v")
+    words = "a.mp4: expected a video that can be decoded, found 9 frames of the codec FMP4", "-c:v libx264"
+    assert_refused(lambda: probe(path), *words, unchanged=tmp_path)
+
+
 @pytest.mark.parametrize("fraction", [0.2, 0.95])
-def test_a_truncated_video_names_file_and_frame(tmp_path, fraction, capfd):
+def test_of_a_video_that_is_cut_short_the_rest_is_used(tmp_path, fraction, capfd, caplog):
     path = write(tmp_path / "cam1i_s.avi", noise(40))
     content = path.read_bytes()
     path.write_bytes(content[: int(fraction * len(content))])
     video = probe(path)
-    assert video.num_frames == 40  # the header still states 40 frames
-    with pytest.raises(InputError) as error_info:
-        list(read_frames(video))
-    message = str(error_info.value)
-    reached = int(re.search(r"only (\d+) can be decoded", message)[1])
-    assert 0 < reached < 40
-    assert message.endswith(
-        f"`ffmpeg -i cam1i_s.avi -frames:v {reached} -c copy cam1i_s_cut.avi` keeps the frames before"
-    )
-    refused = "cam1i_s.avi: expected 40 frames, found that only "
-    assert_refused(lambda: check_end(video), refused, unchanged=tmp_path)
-    # With a step, the error names the same frame.
-    assert_refused(lambda: list(read_frames(video, 7)), f"{refused}{reached} can", unchanged=tmp_path)
-    # The frames before the broken frame can be used.
-    assert len(list(read_frames(replace(video, num_frames=reached)))) == reached
+    assert 0 < video.num_frames < 40
+    assert len(list(read_frames(video))) == video.num_frames
+    assert f"its header says 40 frames until 1.60 s, and the {video.num_frames} that can be" in caplog.text
+    longer = replace(video, num_frames=40)
+    refused = f"cam1i_s.avi: expected 40 frames, found that only {video.num_frames} can be decoded"
+    for step in (1, 7):
+        assert_refused(lambda step=step: list(read_frames(longer, step)), refused, unchanged=tmp_path)
     assert capfd.readouterr().err == ""
 
 
@@ -245,7 +315,7 @@ def test_parts_that_differ_or_end_early_are_refused(tmp_path, capfd):
     for name, words in (
         ("slow.avi", "expected 96 x 64 pixels at 25 Hz as in 0.avi, found 96 x 64 pixels at 24 Hz"),
         ("small.avi", "expected 96 x 64 pixels at 25 Hz as in 0.avi, found 48 x 32 pixels at 25 Hz"),
-        ("cut.avi", "expected 20 frames, found that only "),
+        ("cut.avi", "expected a whole video, found one that is cut short"),
     ):
         join = partial(join_videos, tmp_path / "joined.avi", [first, tmp_path / name])
         assert_refused(join, f"{name}: {words}", unchanged=tmp_path)

@@ -27,7 +27,7 @@ from psotrack.foreground.silhouettes.settings import (
 from psotrack.foreground.silhouettes.store import LEFT_OUT, Task, open_stored, reduced_shape, store, task_of
 from psotrack.foreground.silhouettes.usable_frames import Interval, in_words
 from psotrack.geometry import Rig, looking_depths_m
-from psotrack.recordings import FrameTimes, Recording, StoredSilhouettes, TruncatedVideoError
+from psotrack.recordings import FrameTimes, Recording, StoredSilhouettes
 from psotrack.support import Report, identify, lasting_name, make_plugin, map_in_processes, no_progress
 
 logger = logging.getLogger(__name__)
@@ -92,10 +92,7 @@ def compute(
     for path in dict.fromkeys(places[name].path for name in missing):
         if path.exists():
             logger.warning("%s: damaged silhouettes; they are made anew", path)
-    try:
-        seconds = _make(list(missing.values()), jobs, report)
-    except TruncatedVideoError as error:
-        raise _counted_in_instants(error, recording) from None
+    seconds = _make(list(missing.values()), jobs, report)
     places |= {name: task.stored for name, task in missing.items()}
     opened |= {name: _opened(name, places[name], tasks, recording.rig, scaled) for name in missing}
     arrays: dict[str, zarr.Array | FramesOfInstants] = {}
@@ -293,15 +290,6 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
         with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
             taken = map_in_processes(store, missing, jobs=jobs, advance=advance)
     return {stage: sum((each[stage] for each in taken), 0.0) for stage in ("decode", "foreground")}
-
-
-def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> TruncatedVideoError:
-    """The same error with the number of instants before the missing frame: `--frames` counts instants."""
-    timeline = recording.timeline()
-    frame = timeline.frame[:, [recording.videos.get(name) == error.video for name in timeline.cameras]]
-    missing = (frame >= error.num_readable).any(axis=-1)
-    num_instants = int(missing.argmax()) if missing.any() else timeline.num_instants
-    return TruncatedVideoError(error.video, error.num_readable, num_instants)
 
 
 def _left_out(name: str, array: zarr.Array, times: FrameTimes) -> list[Interval]:

@@ -25,6 +25,7 @@ from psotrack.recordings import (
     Reference,
     Timeline,
     VideoInfo,
+    frame_times,
     natural_key,
     probe,
 )
@@ -144,7 +145,7 @@ def _frame_times(videos: Mapping[str, VideoInfo], detections: Mapping[str, Path]
     alone = {name: FrameTimes(most, first.fps) for name in detections if name not in videos}
     # Rates are rounded in headers: rates that differ by less than a thousandth of a hertz are one rate.
     return alone | {
-        name: FrameTimes(video.num_frames, first.fps if abs(video.fps - first.fps) < 1e-3 else video.fps)
+        name: frame_times(replace(video, fps=first.fps) if abs(video.fps - first.fps) < 1e-3 else video)
         for name, video in videos.items()
     }
 

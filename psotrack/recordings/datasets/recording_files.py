@@ -35,6 +35,7 @@ from psotrack.recordings import (
     check_rate,
     file_error,
     find_images,
+    frame_times,
     open_pictures,
     probe,
     probe_images,
@@ -220,7 +221,7 @@ class _Named:
             return replace(video, fps=self._rate(video.num_frames))
         video = probe(file)
         if table.fps is not None:
-            return replace(video, fps=table.fps)
+            return video.at_rate(table.fps)
         if table.timestamps is None:
             check_rate(file, video.fps, f"write the rate as fps below [cameras.{self.name}]")
         return video
@@ -243,7 +244,7 @@ class _Named:
             return _listed_times(listed, video, silhouettes)
         offset_s, where = table.time_offset_s or 0.0, f"{self.path}, cameras.{self.name}.frames"
         if video is not None:
-            return FrameTimes(video.num_frames, video.fps, offset_s)
+            return frame_times(video, offset_s)
         num_frames = 0
         if silhouettes is not None:
             num_frames = silhouettes.num_frames
