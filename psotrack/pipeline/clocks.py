@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psotrack.calibration.clocks import CameraClocks, clocks_of_tracks
+from psotrack.calibration.clocks import MAX_OFFSET_FRAMES, CameraClocks, clocks_of_tracks
 from psotrack.pipeline.inputs import Run
 from psotrack.recordings import Recording, Timing
 from psotrack.settings import BLOBS
@@ -45,6 +45,19 @@ def estimate_clocks(run: Run, tracks: Tracks, most: int | None = None) -> Camera
         sightings = from_silhouettes(shown)
     part = tracks.with_arrays(lambda _, values: values[rows])
     return clocks_of_tracks(run.recording.rig, sightings, timeline.part(rows), part, shown)
+
+
+def warn_of_unknown_clocks(clocks: CameraClocks, recording: Recording) -> None:
+    """Warn of the cameras whose clocks the tracks do not show."""
+    names = [name for name, known in zip(recording.rig.names, clocks.known, strict=True) if not known]
+    if names:
+        logger.warning(
+            "--clocks auto: found no lag of camera %s within %g frames (%.0f ms), as far as it searches: their given "
+            "times are used; a larger lag must be in time_offset_s",
+            ", ".join(names),
+            MAX_OFFSET_FRAMES,
+            1e3 * MAX_OFFSET_FRAMES / recording.fps,
+        )
 
 
 def advise_on_clocks(run: Run, tracks: Tracks) -> None:

@@ -31,7 +31,7 @@ from psotrack.foreground.silhouettes import (
     find_background,
     scaled_settings,
 )
-from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
+from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, warn_of_unknown_clocks, with_clocks
 from psotrack.pipeline.inputs import Run, prepare, usable_for
 from psotrack.pipeline.parts import (
     MethodInputs,
@@ -179,6 +179,7 @@ def _track(
         result = _result_of(run, by_swarm.get(run), report)
         if given.clocks == "auto" and result.tracks.num_drones:
             clocks = estimate_clocks(run, result.tracks)
+            warn_of_unknown_clocks(clocks, run.recording)
             once = msgspec.structs.replace(given, clocks="given")
             corrected = with_clocks(run.recording, clocks)
             ((again, result),) = _track(corrected, silhouettes, [once], parts, report)

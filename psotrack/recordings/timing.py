@@ -257,6 +257,11 @@ def make_timeline(frame_times: Mapping[str, FrameTimes], rate_hz: float | None =
         _check_length(frame_times, rate)
         timeline = _of_nearest_frames(tuple(frame_times), times, rate)
     if not timeline.num_instants:
+        later_s = [time_s for each in times for time_s in each.time_s if time_s >= 0]
+        if later_s:
+            expected = f"a camera with a frame near one of the instants, {rate:g} Hz from time 0 s on"
+            found = f"frames from {min(later_s):g} to {max(later_s):g} s"
+            raise InputError("frame times", expected=expected, found=found, remedy="choose another rate")
         raise InputError("frame times", expected="a camera with a frame at time 0 s or later", found="none")
     return timeline
 

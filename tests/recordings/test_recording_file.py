@@ -569,6 +569,10 @@ FRAME_TIMES = {
     "an infinite rate": (timeline(FrameTimes(10, 25.0), np.inf), "rate: expected a number above 0"),
     "a time of NaN": (listed(0.0, np.nan, 0.1), "expected finite times, found nan s for frame 1"),
     "nothing from time 0 on": (timeline(FrameTimes(10, 25.0, -1.0)), "a camera with a frame at time 0 s or later"),
+    "no frame near an instant": (
+        timeline(FrameTimes.listed(np.array([0.1, 0.1078])), 25.0),
+        "near one of the instants, 25 Hz from time 0 s on, found frames from 0.1 to 0.1078 s; choose another rate",
+    ),
 }  # fmt: skip
 SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
 SCALED = "if both show the same field of view, multiply the first two rows of K by "

@@ -123,6 +123,7 @@ def test_a_camera_that_sees_nothing_changes_nothing_for_the_others():
     assert (np.abs(error_s - error_s.mean()) < 1e-3).all()
     assert (found.offset_std_s[others] < 1e-3).all()
     assert (found.offset_s[1], found.offset_std_s[1]) == (0.0, np.inf)
+    assert found.known.tolist() == [True, False, True, True, True]
     assert found.record(RIG.names)[RIG.names[1]]["offset_std_s"] is None
 
 
@@ -144,6 +145,26 @@ def test_a_clock_that_runs_fast_is_found():
     assert found.drift[2] == pytest.approx(25 / 25.1 - 1, abs=3e-4)
     corrected = found.corrected(alike(250), RIG.names)[RIG.names[2]]
     np.testing.assert_allclose(corrected.time_s, shown[RIG.names[2]].time_s, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "camera", "frame", "count"), [(5, 2, 140, 1), (5, 4, 170, 3), (2, 1, 130, 1)]
+)
+def test_lost_frames_are_a_step_at_their_frame_and_no_drift(cameras, camera, frame, count):
+    """Found: a line through the offsets, by which most frames were off by up to half the step."""
+    rig, number = RIG.select(RIG.names[:cameras]), np.arange(300)
+    given = alike(300, rig.names)
+    lost = {RIG.names[camera]: FrameTimes.listed((number + count * (number >= frame)) / FPS)}
+    shown, timeline = sightings_of(alike(300) | lost), make_timeline(given)
+    shown = Sightings(shown.centre_px[:, :cameras], shown.size_px[:, :cameras], shown.noise_px[:, :cameras])
+    found = clocks_of_tracks(rig, shown, timeline, tracked(timeline))
+    (of_camera,) = found.lost
+    assert (of_camera.camera, of_camera.frame, of_camera.count) == (camera, frame, count)
+    assert not found.drift.any()
+    corrected = found.corrected(given, rig.names)[rig.names[camera]]
+    np.testing.assert_allclose(corrected.time_s, lost[rig.names[camera]].time_s, atol=4e-3)
+    record = found.record(rig.names)[rig.names[camera]]
+    assert record["lost_frames"] == [{"before_frame": frame, "count": count}]
 
 
 @pytest.mark.parametrize("late", [2.0, -2.0])

@@ -2,19 +2,20 @@
 
 The tracks say which sightings are of which drone. The clocks themselves come from the sightings: `camera_clocks`
 estimates constant offsets in each of several stretches of the recording, and a straight line through the offsets of
-the stretches gives offset and drift. Only differences between cameras show: the median of all offsets, and of all
-drifts, is 0.
+the stretches gives offset and drift. A camera that loses frames runs later from there on: a step, not a drift. Only
+differences between cameras show: the median of all offsets, and of all drifts, is 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.clocks.camera_clocks import camera_offsets
+from psotrack.calibration.clocks.camera_clocks import camera_offsets, misfits
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import NEAR_M, Camera, Rig, project
 from psotrack.recordings import FrameTimes, Timeline
@@ -40,13 +41,33 @@ _LEAST_INSTANTS, _MOST_STRETCHES = 60, 12
 _CLEARLY = 5.0
 #: An offset counts only if its standard deviation is below this share of an interval between instants.
 _KNOWN = 0.25
+#: A step is a whole number of the camera's frames, up to this share of one; and largest number of steps that are found.
+_WHOLE, _MOST_STEPS = 0.25, 6
+
+
+@dataclass(frozen=True)
+class LostFrames:
+    """Frames that a camera lost: those from some frame on were exposed later than they count.
+
+    Attributes:
+        camera: index of the camera.
+        frame: its first frame after the lost ones, in its own counting; hovering bodies show it badly.
+        count: number of lost frames.
+        step_s: their time, seconds.
+    """
+
+    camera: int
+    frame: int
+    count: int
+    step_s: float
 
 
 @dataclass(frozen=True)
 class CameraClocks:
     """Estimated corrections of the times of the cameras' frames.
 
-    A frame that was given the time t was exposed at t + offset + drift * (t - middle).
+    A frame that was given the time t was exposed at t + offset + drift * (t - middle), where the steps of the frames
+    that were lost before it are in t.
 
     Attributes:
         offset_s: (cameras,), offset in the middle of the recording, seconds; the median is 0. A video that shows the
@@ -55,6 +76,8 @@ class CameraClocks:
         drift: (cameras,), seconds per second; 0 where none is certain.
         drift_std: (cameras,), standard deviations of the drifts; infinite where the recording is too short.
         middle_s: time of the middle of the recording, seconds.
+        known: (cameras,), whether the sightings show the offset.
+        lost: frames that the cameras lost.
     """
 
     offset_s: Float[np.ndarray, "cameras"]
@@ -62,6 +85,8 @@ class CameraClocks:
     drift: Float[np.ndarray, "cameras"]
     drift_std: Float[np.ndarray, "cameras"]
     middle_s: float
+    known: Bool[np.ndarray, "cameras"]
+    lost: tuple[LostFrames, ...] = ()
 
     @property
     def late_s(self) -> Float[np.ndarray, "cameras"]:
@@ -73,18 +98,26 @@ class CameraClocks:
     ) -> dict[str, FrameTimes]:
         """Frame times with the corrections of these cameras, in the order of the estimate."""
         changed = dict(frame_times)
+        for lost in self.lost:
+            if (times := changed.get(cameras[lost.camera])) is not None:
+                later = np.arange(times.num_frames) >= lost.frame
+                changed[cameras[lost.camera]] = FrameTimes.listed(times.time_s + lost.step_s * later)
         for name, offset_s, drift in zip(cameras, self.offset_s.tolist(), self.drift.tolist(), strict=True):
             if name in changed:
                 changed[name] = changed[name].corrected(offset_s - drift * self.middle_s, drift)
         return changed
 
-    def record(self, cameras: Sequence[str]) -> dict[str, dict[str, float | None]]:
+    def record(self, cameras: Sequence[str]) -> dict[str, dict[str, Any]]:
         """Corrections by camera name, fit for JSON; None for a standard deviation that is not known."""
         keys = "offset_s", "late_s", "offset_std_s", "drift", "drift_std"
-        return {
+        found: dict[str, Any] = {
             name: {key: finite_or_none(getattr(self, key)[index]) for key in keys}
             for index, name in enumerate(cameras)
         }
+        for lost in self.lost:
+            of_camera = found[cameras[lost.camera]].setdefault("lost_frames", [])
+            of_camera.append({"before_frame": lost.frame, "count": lost.count})
+        return found
 
     def is_certain(self, least_s: float, multiple: float = 5.0) -> Bool[np.ndarray, "cameras"]:
         """(cameras,), whether an offset is at least `least_s`, and this multiple of its standard deviation."""
@@ -243,13 +276,38 @@ def _interpolate(places_px: Float[np.ndarray, "instants drones 2"], timeline: Ti
 def estimate_clocks(
     rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline
 ) -> CameraClocks:
-    """Estimate offset and drift of each camera's clock from matched sightings.
+    """Estimate offset and drift of each camera's clock, and the frames that it lost, from matched sightings.
 
     Args:
         rig: the calibrated cameras.
         points_px: (instants, drones, cameras, 2), matched sightings at the instants (see `places_of_tracks`).
         timeline: the instants.
     """
+    lost: list[LostFrames] = []
+    stretches = _offsets_of_stretches(rig, points_px, timeline)
+    while (
+        len(lost) < _MOST_STEPS and (found := _lost_frames(rig, points_px, timeline, stretches)) is not None
+    ):
+        row, frames = found
+        points_px = _as_exposed(points_px, timeline, frames.camera, row, frames.step_s)
+        lost.append(frames)
+        stretches = _offsets_of_stretches(rig, points_px, timeline)
+    clocks = fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
+    return replace(clocks, lost=tuple(lost))
+
+
+#: Middle of each stretch, offsets of the cameras in it and their standard deviations, seconds.
+_Stretches = tuple[
+    Float[np.ndarray, "stretches"],
+    Float[np.ndarray, "stretches cameras"],
+    Float[np.ndarray, "stretches cameras"],
+]
+
+
+def _offsets_of_stretches(
+    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline
+) -> _Stretches:
+    """Constant offsets in each of several stretches."""
     num_stretches = int(np.clip(len(points_px) // _LEAST_INSTANTS, 1, _MOST_STRETCHES))
     parts = np.array_split(np.arange(len(points_px)), num_stretches)
     estimates = [
@@ -264,7 +322,73 @@ def estimate_clocks(
     # One stretch of one camera shows badly how far its errors are correlated: all tell it together.
     larger = np.sqrt(max(float(np.mean(ratio[shown] ** 2)), 1.0)) if shown.any() else 1.0
     std_s = np.where(shown, larger * white_s, np.inf)
-    return fit_clocks(time_s, offset_s, std_s, known_s=_KNOWN / timeline.rate_hz)
+    return time_s, offset_s, std_s
+
+
+def _lost_frames(
+    rig: Rig,
+    points_px: Float[np.ndarray, "instants drones cameras 2"],
+    timeline: Timeline,
+    stretches: _Stretches,
+) -> tuple[int, LostFrames] | None:
+    """The most certain step of a clock and its instant; None where no step fits better than even clocks.
+
+    The stretch with the step has no offset of its own, so it is left out of both fits.
+    """
+    time_s, offset_s, std_s = stretches
+    number = np.arange(len(time_s))
+    best: tuple[float, int, Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]] | None = None
+    for middle in number[1:-1]:
+        others_s = np.where((number == middle)[:, None], np.inf, std_s)
+        step, line = (
+            _fit(np.stack([np.ones(len(number)), change], axis=-1), offset_s, others_s)
+            for change in (number > middle, time_s - time_s.mean())
+        )
+        # Of two cameras, that which is later afterwards has lost frames.
+        jump_s = step[0][:, 1] - np.sort(step[0][:, 1])[(len(rig) - 1) // 2]
+        certainty = jump_s / np.sqrt(np.diag(step[1])[1::2])
+        camera = int(certainty.argmax())
+        if step[2] < line[2] and certainty[camera] > _CLEARLY and (best is None or step[2] < best[0]):
+            best = step[2], camera, step[0][:, 0], jump_s
+    if best is None:
+        return None
+    _, camera, before_s, jump_s = best
+    shown = np.flatnonzero(timeline.frame[:, camera] >= 0)
+    first, last = shown[0], shown[-1]
+    interval_s = float(np.ptp(timeline.time_s[[first, last]]) / np.ptp(timeline.frame[[first, last], camera]))
+    count = int(np.rint(jump_s[camera] / interval_s))
+    if count < 1 or abs(jump_s[camera] / interval_s - count) > _WHOLE:
+        return None
+    step_s = count * interval_s
+    after_s = before_s + step_s * (np.arange(len(rig)) == camera)
+    before, after = (misfits(rig.cameras, points_px, each * timeline.rate_hz) for each in (before_s, after_s))
+    # Before about this instant the clock as it was fits better, from it on the one that is later.
+    row = int(np.append(0.0, np.cumsum(before - after)).argmin())
+
+    def misfit(row: int) -> float:
+        moved_px = _as_exposed(points_px, timeline, camera, row, step_s)
+        return float(misfits(rig.cameras, moved_px, before_s * timeline.rate_hz).sum())
+
+    reach = 1 + round(step_s * timeline.rate_hz)
+    row = min(range(max(row - reach, 0), row + reach + 1), key=misfit)
+    row = int(shown[np.clip(np.searchsorted(shown, row), 0, len(shown) - 1)])
+    return row, LostFrames(camera, int(timeline.frame[row, camera]), count, step_s)
+
+
+def _as_exposed(
+    points_px: Float[np.ndarray, "instants drones cameras 2"],
+    timeline: Timeline,
+    camera: int,
+    row: int,
+    step_s: float,
+) -> Float[np.ndarray, "instants drones cameras 2"]:
+    """The points at the instants if a camera's frames from an instant on were exposed later."""
+    moved_px, time_s = points_px.copy(), timeline.time_s.copy()
+    time_s[row:] += step_s
+    # Interpolated over the lost frames, too: a wrong instant must not drop the place that shows that it is wrong.
+    at = interpolated(time_s, points_px[:, :, camera], step_s + _MAX_GAP / timeline.rate_hz)
+    moved_px[:, :, camera] = at(timeline.time_s)
+    return moved_px
 
 
 def fit_clocks(
@@ -284,10 +408,10 @@ def fit_clocks(
     """
     num_stretches, num_cameras = offset_s.shape
     middle_s = float(time_s.mean())
-    fitted_s, covariance_s2 = _fit(np.ones((num_stretches, 1)), offset_s, std_s)
+    fitted_s, covariance_s2, _ = _fit(np.ones((num_stretches, 1)), offset_s, std_s)
     drift, drift_std = np.zeros(num_cameras), np.full(num_cameras, np.inf)
     if num_stretches >= 3:
-        both, covariance = _fit(
+        both, covariance, _ = _fit(
             np.stack([np.ones(num_stretches), time_s - middle_s], axis=-1), offset_s, std_s
         )
         found = both[:, 1] - np.median(both[:, 1])
@@ -299,15 +423,15 @@ def fit_clocks(
     known = offset_std_s < known_s
     zero_s = float(np.median(fitted_s[known])) if known.any() else 0.0
     offset_s = np.where(known, fitted_s[:, 0] - zero_s, 0.0)
-    return CameraClocks(offset_s, offset_std_s, np.where(known, drift, 0.0), drift_std, middle_s)
+    return CameraClocks(offset_s, offset_std_s, np.where(known, drift, 0.0), drift_std, middle_s, known)
 
 
 def _fit(
     basis: Float[np.ndarray, "stretches terms"],
     offset_s: Float[np.ndarray, "stretches cameras"],
     std_s: Float[np.ndarray, "stretches cameras"],
-) -> tuple[Float[np.ndarray, "cameras terms"], Float[np.ndarray, "unknowns unknowns"]]:
-    """Coefficients of each camera, relative to the mean of all cameras, and their covariance.
+) -> tuple[Float[np.ndarray, "cameras terms"], Float[np.ndarray, "unknowns unknowns"], float]:
+    """Coefficients of each camera, relative to the mean of all cameras, their covariance, and the scatter about them.
 
     Where the offsets scatter more than their standard deviations say, the covariance is larger accordingly.
     """
@@ -331,4 +455,4 @@ def _fit(
     share = known / known.sum() if known.any() else np.full(num_cameras, 1 / num_cameras)
     centred = np.kron(np.eye(num_cameras) - share, np.eye(terms))
     coefficients = solution[:unknowns].reshape(num_cameras, terms)
-    return coefficients - share @ coefficients, centred @ covariance @ centred.T
+    return coefficients - share @ coefficients, centred @ covariance @ centred.T, scatter
