@@ -279,9 +279,9 @@ def read_frames(
         raise SettingsError("step", expected="1 or more", found=f"{step}")
     if video.images:
         for path in video.images[: video.num_frames : step]:
-            frame = read_image(path, video.depth_bits)
-            _check_size(path, video, frame)
-            yield frame
+            image = read_image(path, video.depth_bits)
+            _check_size(path, video, image)
+            yield image
         return
     frame: UInt8[np.ndarray, "height width 3"] | None = None
     reached = -1

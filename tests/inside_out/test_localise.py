@@ -121,6 +121,26 @@ def test_the_filter_and_the_smoother_bridge_frames_without_markers(localise):
     assert off_m(smoothed).max() < 0.01
 
 
+def test_pictures_that_a_conversion_to_a_higher_rate_repeated_are_left_out(localise, drawn, tmp_path, caplog):
+    """From 25 to 30 frames per second, one picture in six is shown twice, and others at times that are 13 ms off."""
+    shown = np.floor(np.arange(NUM_FRAMES * 6 // 5) * 5 / 6 + 0.5).astype(int)
+    shown = shown[shown < NUM_FRAMES]
+    writer = cv2.VideoWriter(str(tmp_path / "30.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (640, 480))
+    for number in shown.tolist():
+        writer.write(cv2.imread(str(drawn / "images" / f"frame{number}.png")))
+    writer.release()
+    path = localise(tmp_path / "30.avi", "--smooth")[0]
+    again = np.append(False, np.diff(shown) == 0)
+    assert again.sum() == 2
+    assert (
+        f"{again.sum()} of {len(shown)} frames repeat the picture before, and are left out: the"
+        in caplog.text
+    )
+    assert "converted from 25 frames per second" in caplog.text
+    assert path.seen.all()
+    assert off_m(path, TRUTH_M[shown])[~again].max() < 0.01
+
+
 def test_the_json_names_the_shutter_and_the_reference_row(localise):
     _, content, _ = localise("flight.avi", "--frames", 3, "--readout", "0.024")
     assert content["shutter"] == {

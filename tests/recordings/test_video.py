@@ -139,6 +139,8 @@ TIMED = {
     "another rate": (lambda folder: mp4(folder, range(0, 120, 2)), range(60), 15.0, ""),
     "hidden frames": (lambda folder: with_hidden(mp4(folder, range(60)), 12), range(48), 30.0,
         "a.mp4: its header says 60 frames until 2.00 s, and the 48 that can be decoded end at 1.60 s"),
+    "a damaged frame": (lambda folder: packed(folder / "a.mkv", [*encoded(folder, "VP80", 12)[:9],
+        (np.zeros(40, np.uint8), 0.0), *encoded(folder, "VP80", 20)], range(30), "VP80"), range(30), 30.0, ""),
     "no key frame": (
         lambda folder: packed(
             folder / "a.mkv", encoded(folder, "VP80", 12)[5:] + encoded(folder, "VP80", 53), range(60), "VP80"

@@ -13,6 +13,7 @@ from .foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_f
 from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
 from .masks import masks_out, write_masks
+from .repeated_frames import FrameChanges, repeated_frames
 from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import SEAL_FILE, Task, ignored_pixels, is_whole
 from .summed_area import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
@@ -25,6 +26,7 @@ __all__ = [
     "CacheEntry",
     "Exposures",
     "ForegroundSettings",
+    "FrameChanges",
     "Living",
     "LivingBackground",
     "Mog2",
@@ -54,6 +56,7 @@ __all__ = [
     "packed_box_sums",
     "reduce_frame",
     "remove_entry",
+    "repeated_frames",
     "scaled_settings",
     "stored_silhouettes",
     "summed_area_table",

@@ -24,8 +24,16 @@ from psotrack.foreground.silhouettes.settings import (
     SilhouetteSettings,
     check_whole,
 )
-from psotrack.foreground.silhouettes.store import LEFT_OUT, Task, open_stored, reduced_shape, store, task_of
-from psotrack.foreground.silhouettes.usable_frames import Interval, in_words
+from psotrack.foreground.silhouettes.store import (
+    LEFT_OUT,
+    REPEATED,
+    Task,
+    open_stored,
+    reduced_shape,
+    store,
+    task_of,
+)
+from psotrack.foreground.silhouettes.usable_frames import Interval, in_words, intervals_of
 from psotrack.geometry import Rig, looking_depths_m
 from psotrack.recordings import FrameTimes, Recording, StoredSilhouettes
 from psotrack.support import Report, identify, lasting_name, make_plugin, map_in_processes, no_progress
@@ -37,6 +45,20 @@ _OPEN = ("reduction", "working_reduction", "min_blob_px")
 
 #: Width of a usual drone, metres: most are wider; smaller ones have fewer pixels in the reduced images.
 _USUAL_DRONE_M = 0.3
+
+#: Attributes of frames that are left out, why they are, and what the user may look at.
+_WHY_LEFT_OUT = (
+    (
+        LEFT_OUT,
+        "foreground is everywhere in the image",
+        "a camera that moved, or light that the background model does not follow?",
+    ),
+    (
+        REPEATED,
+        "they repeat the picture before",
+        "a stream that froze, frames that were lost or are damaged, or a video converted to a higher rate?",
+    ),
+)
 
 
 def compute(
@@ -293,19 +315,25 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
 
 
 def _left_out(name: str, array: zarr.Array, times: FrameTimes) -> list[Interval]:
-    """Intervals of a camera's frames in which the foreground makes no sense, said in a warning."""
-    stored: Any = array.attrs[LEFT_OUT]  # as JSON keeps them
-    intervals = [(start, min(stop, times.num_frames)) for start, stop in stored if start < times.num_frames]
-    if intervals:
-        logger.warning(
-            "camera %s: %d of %d frames are left out, because foreground is everywhere in the image: frames %s; "
-            "a camera that moved, or light that the background model does not follow?",
-            name,
-            sum(stop - start for start, stop in intervals),
-            times.num_frames,
-            in_words(intervals, gap_frames=max(1, round(times.fps))),
-        )
-    return intervals
+    """Intervals of a camera's frames that are left out, said in warnings."""
+    left_out = np.zeros(times.num_frames, bool)
+    for attribute, why, remedy in _WHY_LEFT_OUT:
+        stored: Any = array.attrs.get(attribute, [])  # as JSON keeps them
+        chosen = np.zeros_like(left_out)
+        for start, stop in stored:
+            chosen[start:stop] = True
+        if chosen.any():
+            logger.warning(
+                "camera %s: %d of %d frames are left out, because %s: frames %s; %s",
+                name,
+                np.count_nonzero(chosen),
+                times.num_frames,
+                why,
+                in_words(intervals_of(chosen), gap_frames=max(1, round(times.fps))),
+                remedy,
+            )
+        left_out |= chosen
+    return intervals_of(left_out)
 
 
 def _without(array: zarr.Array, intervals: list[Interval]) -> FramesOfInstants:

@@ -27,6 +27,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes.first_look import look_first
 from psotrack.foreground.silhouettes.foreground import BackgroundModel, coverage, learning_step, reduce_frame
 from psotrack.foreground.silhouettes.living_background import Living
+from psotrack.foreground.silhouettes.repeated_frames import FrameChanges, repeated_frames
 from psotrack.foreground.silhouettes.settings import ForegroundSettings
 from psotrack.foreground.silhouettes.usable_frames import LEAST_FRAMES, foreground_is_everywhere, intervals_of
 from psotrack.recordings import (
@@ -73,13 +74,14 @@ def is_whole(folder: Path) -> bool:
 
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
-SCHEMA = 1
+SCHEMA = 2
 
 #: Number of frames that are compressed and read together.
 CHUNK_FRAMES = 25
 
-#: Attribute of stored silhouettes: intervals of the frames in which the foreground makes no sense.
-LEFT_OUT = "left_out"
+#: Attributes of stored silhouettes: intervals of the frames in which the foreground makes no sense, and of those that
+#: repeat the picture before.
+LEFT_OUT, REPEATED = "left_out", "repeated"
 
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
@@ -216,7 +218,8 @@ def _write(
         config={"write_empty_chunks": True},
     )
     chunk, everywhere = np.empty((CHUNK_FRAMES, *shape[1:]), np.uint8), [np.zeros(0, bool)]
-    for index, mask in enumerate(foreground_of(task, seconds, advance)):
+    changes = FrameChanges()
+    for index, mask in enumerate(foreground_of(task, seconds, advance, changes)):
         chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
         count = index % CHUNK_FRAMES + 1
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
@@ -224,6 +227,7 @@ def _write(
             everywhere.append(foreground_is_everywhere(chunk[:count]))
             _move_to_disk(files, folder)
     array.update_attributes({LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
+    array.update_attributes({REPEATED: intervals_of(repeated_frames(changes.found))})
     _move_to_disk(files, folder)
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
 
@@ -236,7 +240,7 @@ def _move_to_disk(files: dict[str, Buffer], folder: Path) -> None:
 
 
 def foreground_of(
-    task: Task, seconds: dict[str, float], advance: Advance
+    task: Task, seconds: dict[str, float], advance: Advance, changes: FrameChanges | None = None
 ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
     """Yield the mask of each frame, without what is ignored: 0 to 255, a pixel per `working_reduction` pixels.
 
@@ -244,6 +248,7 @@ def foreground_of(
         task: the video, the settings and the background model.
         seconds: the time of "decode" is added.
         advance: is told of each decoded frame, `Task.num_decoded` in all.
+        changes: is given each frame.
 
     Raises:
         InputError: the video ends early.
@@ -252,7 +257,7 @@ def foreground_of(
     video, settings, background = task.video, task.settings, task.background
     # "living" keeps only reduced frames. A model that the user brings may keep what it is given.
     into_one = isinstance(background, Living) and settings.working_reduction > 1
-    frames = _decoded(read_frames(video, into_one=into_one), seconds, advance)
+    frames = _decoded(read_frames(video, into_one=into_one), seconds, advance, changes)
     if isinstance(background, Living) and settings.first_look:
         masks = background.masks(*look_first(video, frames, settings))
     elif isinstance(background, Living):
@@ -307,7 +312,10 @@ def _wrong_masks(task: Task, shape: tuple[int, int], found: str) -> SettingsErro
 
 
 def _decoded(
-    frames: Iterator[UInt8[np.ndarray, "height width 3"]], seconds: dict[str, float], advance: Advance
+    frames: Iterator[UInt8[np.ndarray, "height width 3"]],
+    seconds: dict[str, float],
+    advance: Advance,
+    changes: FrameChanges | None = None,
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield frames; adds the time that they take to `seconds`, and advances the progress bar by each frame."""
     while True:
@@ -316,5 +324,7 @@ def _decoded(
         seconds["decode"] += time.perf_counter() - started
         if frame is None:
             return
+        if changes is not None:
+            changes.add(frame)
         yield frame
         advance(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Iterable, Iterator
@@ -12,6 +13,7 @@ from jaxtyping import UInt8
 
 from psotrack.errors import InputError
 from psotrack.foreground.markers import MarkerDetector
+from psotrack.foreground.silhouettes import FrameChanges, repeated_frames
 from psotrack.geometry import Camera
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.lens_files import check_size
@@ -22,8 +24,11 @@ from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.inside_out.rolling_shutter import Detected
 from psotrack.support import Advance, Report, no_progress
 
+_logger = logging.getLogger(__name__)
 #: Number of threads that detect markers, each in a frame of its own; the calling thread has the rest of the work.
 _WORKERS = max(1, min(4, (os.cpu_count() or 1) - 1))
+#: Largest distance of a converted video's pictures from even times, intervals: half of one, and a tenth for rounding.
+_UNEVEN = 0.6
 #: Number, time (seconds) and grey image of a frame.
 _GreyFrame = tuple[int, float, UInt8[np.ndarray, "height width"]]
 
@@ -67,9 +72,10 @@ def localise_video(
     seconds, unknown = dict.fromkeys(STAGES, 0.0), tuple[int, ...]()
     began_s = time.perf_counter()
     with report("localise", source.num_frames or 0) as done:
-        detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds), done)
+        changes = FrameChanges()
+        detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds, changes), done)
         if not source.stream:
-            detected = list(detected)
+            detected = _without_repeats(source.name, list(detected), changes)
         if isinstance(marker_map, MarkerCentres):
             marker_map, unknown, detected = _completed(source, marker_map, lens, detected, side_m)
         found = localise_frames(detected, marker_map, lens, settings, seconds)
@@ -100,6 +106,33 @@ def _completed(
     return marker_map, tuple(sorted(seen - set(known.tolist()))), frames
 
 
+def _without_repeats(name: str, detected: list[Detected], changes: FrameChanges) -> list[Detected]:
+    """The frames without markers in those that repeat the picture before.
+
+    Where the other pictures come evenly, as before a conversion to a higher rate, their times are made even.
+    """
+    repeated = repeated_frames(changes.found)
+    if not repeated.any():
+        return detected
+    times_s, new = np.array([time_s for _, time_s, _ in detected]), np.flatnonzero(~repeated)
+    order = np.arange(len(new))
+    even_s = np.polyval(np.polyfit(order, times_s[new], 1), order) if len(new) > 1 else times_s[new]
+    longest_s = _UNEVEN * np.median(np.diff(times_s))
+    is_converted = len(new) > 2 and bool((np.abs(even_s - times_s[new]) <= longest_s).all())
+    if is_converted:
+        times_s[new] = even_s
+    _logger.warning(
+        "%s: %d of %d frames repeat the picture before, and are left out: %s",
+        name, np.count_nonzero(repeated), len(detected),
+        f"the video was converted from {1 / np.diff(even_s).mean():.4g} frames per second"
+        if is_converted else "a stream that froze, or frames that were lost or are damaged",
+    )  # fmt: skip
+    return [
+        (number, time_s, markers.select(np.full(len(markers), not again)))
+        for (number, _, markers), time_s, again in zip(detected, times_s.tolist(), repeated, strict=True)
+    ]
+
+
 def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
     for one in detected:
         yield one
@@ -107,7 +140,7 @@ def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
 
 
 def _detect_markers(
-    source: FrameSource, detector: MarkerDetector, seconds: dict[str, float]
+    source: FrameSource, detector: MarkerDetector, seconds: dict[str, float], changes: FrameChanges
 ) -> Iterator[Detected]:
     def found(frame: _GreyFrame) -> tuple[Detected, float]:
         number, time_s, gray = frame
@@ -116,7 +149,7 @@ def _detect_markers(
         markers = detector.detect(gray).of_single_ids()
         return (number, time_s, markers), time.perf_counter() - start_s
 
-    frames = read_ahead(_grey_frames(source, seconds), newest=source.newest)
+    frames = read_ahead(_grey_frames(source, seconds, changes), newest=source.newest)
     # Frames that wait in line would no longer be the newest.
     workers = 0 if source.newest else _WORKERS
     for detected, spent_s in map_ahead(found, frames, workers):
@@ -124,7 +157,9 @@ def _detect_markers(
         yield detected
 
 
-def _grey_frames(source: FrameSource, seconds: dict[str, float]) -> Iterator[_GreyFrame]:
+def _grey_frames(
+    source: FrameSource, seconds: dict[str, float], changes: FrameChanges
+) -> Iterator[_GreyFrame]:
     frames: Iterator[Frame] = source.frames()
     while True:
         start_s = time.perf_counter()
@@ -134,5 +169,7 @@ def _grey_frames(source: FrameSource, seconds: dict[str, float]) -> Iterator[_Gr
         if frame is None:
             return
         gray = frame.grey()
+        if not source.stream:
+            changes.add(gray)
         seconds["grey"] += time.perf_counter() - decoded_s
         yield frame.number, frame.time_s, gray
