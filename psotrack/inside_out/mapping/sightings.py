@@ -16,7 +16,7 @@ from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.geometry import Camera, undistort
 from psotrack.inside_out.lens_files import check_size
 from psotrack.inside_out.marker_map import SQUARE
-from psotrack.recordings import VideoInfo, read_frames_at
+from psotrack.recordings import VideoInfo, frame_times, read_frames_at
 from psotrack.support import Report, no_progress
 
 #: Largest number of frames of a video that are searched.
@@ -104,9 +104,10 @@ def find_sightings(
     numbers = [_searched(video.num_frames, most_frames) for video, _ in videos]
     with report("markers", sum(map(len, numbers))) as advance:
         for source, (video, _) in enumerate(videos):
+            times_s = frame_times(video).time_s.tolist()
             for number, frame in read_frames_at(video, numbers[source]):
                 gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
-                seen.append((source, number / video.fps, detectors[source].detect(gray)))
+                seen.append((source, times_s[number], detectors[source].detect(gray)))
                 advance(1)
     name = ", ".join(str(video.path) for video, _ in videos)
     return collect_sightings(seen, [lens for _, lens in videos], name)
