@@ -124,7 +124,7 @@ def _without_repeats(name: str, detected: list[Detected], changes: FrameChanges)
     _logger.warning(
         "%s: %d of %d frames repeat the picture before, and are left out: %s",
         name, np.count_nonzero(repeated), len(detected),
-        f"the video was converted from {1 / np.diff(even_s).mean():.4g} frames per second"
+        f"the video was converted from about {1 / np.diff(even_s).mean():.2g} frames per second"
         if is_converted else "a stream that froze, or frames that were lost or are damaged",
     )  # fmt: skip
     return [
