@@ -198,7 +198,7 @@ def prepare(
     key = source, size_m
     found = silhouettes if sightings is None else sightings
     if key not in points and found is not None and (bounds_m is None or speed_m_s is None):
-        points[key] = moving_points(recording.rig, found, recording.fps, size_m)
+        points[key] = moving_points(recording.rig, found, recording.fps, size_m, any_size=source != BLOBS)
     volume = flight_volume(recording.rig, points.get(key), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.pipeline.inputs import Run
-from psotrack.settings import DroneSettings, TrackSettings, flatten
+from psotrack.settings import BLOBS, DroneSettings, TrackSettings, flatten
 from psotrack.support import html_block, html_lines, identify
 from psotrack.tracking.births import (
     BirthRules,
@@ -213,10 +213,9 @@ def _no_drones(run: Run) -> InputError:
     """The error that says why no drone was found, as far as that is known."""
     found = "none in any frame"
     least_m, most_m = BirthRules(size_m=run.settings.drones.size_m).spans_m
-    remedy = (
-        "look at what the cameras see (`psotrack detect --silhouettes`), give the drones' first positions (--init), "
-        f"or their size (--drone-size) if they are not {least_m:.2g} to {most_m:.2g} m wide"
-    )
+    remedy = "look at what the cameras see (`psotrack detect --silhouettes`), give the drones' first positions (--init)"
+    if run.by_swarm or run.settings.detections == BLOBS:
+        remedy += f", or their size (--drone-size) if they are not {least_m:.2g} to {most_m:.2g} m wide"
     recording = run.recording
     detected = run.silhouettes if run.sightings is None else run.sightings
     if detected is not None:

@@ -17,7 +17,7 @@ from psotrack.geometry.rig_files import write_rig
 from psotrack.pipeline import track_recording
 from psotrack.recordings import Detections, write_detections
 from psotrack.recordings.datasets import open_recording
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
+from psotrack.settings import DroneSettings, StatusSettings, TrackSettings
 from psotrack.tracking.births import (
     find_cut_off,
     find_outside,
@@ -359,10 +359,9 @@ def see_all(rig, truth_m, *, clutter=1, **how):
     return see(rig, truth_m, (0.35, 0.35), jitter=0.07, clutter=clutter, **how)
 
 
-def track_in(rig, seen, volume, size_m=None, **status):
-    motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
-    settings = TrackSettings(motion=motion, status=StatusSettings(**status))
-    return track(rig, seen, settings.changed({"drones.size_m": size_m}), bounds_m=volume.bounds_m)
+def track_in(rig, seen, volume, **settings):
+    changed = {"motion.max_speed_m_s": volume.max_speed_m_s, **settings}
+    return track(rig, seen, TrackSettings().changed(changed), bounds_m=volume.bounds_m)
 
 
 def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
@@ -380,18 +379,23 @@ def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
 
 
 @pytest.mark.slow
-def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
-    """Balls of 5 cm: 2 px wide in the cameras, 28 m away."""
-    rig, truth_m, size_m = ground_rig(4), flights(60, (4.0, 11.0)), (0.05, 0.05, 0.05)
-    drones = see_all(rig, truth_m)
-    balls = boxes_of(drones.centre_px, drones.size_px / 6.5)
-    assert not len(moving_points(rig, balls, FPS))
-    volume = flight_volume(rig, moving_points(rig, balls, FPS, size_m))
+@pytest.mark.parametrize("side_m", [0.05, 1.7])
+def test_boxes_may_be_of_bodies_of_any_size_and_blobs_of_a_given_one(side_m):
+    """Balls, 2 px wide in the cameras, 28 m away, and people: no usual drones, but a detector was asked for them."""
+    rig, truth_m = ground_rig(4), flights(60, (4.0, 11.0))
+    drones, size_m = see_all(rig, truth_m), (side_m,) * 3
+    bodies = boxes_of(drones.centre_px, drones.size_px * side_m / 0.35)
+    assert not len(moving_points(rig, bodies, FPS))
+    volume = flight_volume(rig, moving_points(rig, bodies, FPS, any_size=True))
+    told = flight_volume(rig, moving_points(rig, bodies, FPS, size_m))
+    np.testing.assert_allclose(volume.bounds_m, told.bounds_m, atol=0.1)
     assert volume.bounds_from == "cameras and moving points"
-    assert track_in(rig, balls, volume).num_drones == 0
-    assert track_in(rig, balls, volume, size_m).num_drones == 2
+    assert track_in(rig, bodies, volume).num_drones == 2
+    assert track_in(rig, bodies, volume, detections="blobs").num_drones == 0
+    given = {"drones.size_m": size_m, "detections": "blobs"}
+    assert track_in(rig, bodies, volume, **given).num_drones == 2
     # A given size that is wrong hides no usual drone.
-    assert track_in(rig, drones, volume, list(size_m)).num_drones == 2
+    assert track_in(rig, drones, volume, **given).num_drones == 2
 
 
 def test_given_values_win():
@@ -429,7 +433,7 @@ def test_two_cameras_keep_a_track_that_three_began_and_begin_one_late_that_a_thi
     assert kept.num_drones == 1
     assert (kept.status[:, 0] == Status.TRACKED).all()
     assert track_in(rig, two[:25], volume).num_drones == 0
-    assert track_in(rig, two, volume, min_cameras_to_begin=2).num_drones == 1
+    assert track_in(rig, two, volume, **{"status.min_cameras_to_begin": 2}).num_drones == 1
     # A post before the third camera hides the drone: after 30 frames the track counts, from its begin on.
     hidden = track_in(rig, two, volume)
     assert hidden.num_drones == 1

@@ -187,12 +187,15 @@ class BirthRules:
         num_frames: number of frames of the recording; None for a recording without end. In a recording of fewer than
             `WINDOW_FRAMES` frames, four fifths of them are enough.
         size_m: full lengths of the drones, metres; None where they are not given.
+        any_size: whether a drone that is no known one may have any size on which the cameras agree. A detector's boxes
+            are of what was asked for; blobs of foreground are of people and lights too.
     """
 
     min_viewpoints: int | None = None
     ghosts_from: int | None = None
     num_frames: int | None = None
     size_m: tuple[float, ...] | None = None
+    any_size: bool = False
 
     @property
     def min_found(self) -> int:
@@ -409,6 +412,9 @@ class Births:
         if len(spans_m):
             limits = spans_m.min() / SIZE_RATIO, spans_m.max() * SIZE_RATIO
         span_m = crossed.span_m.max(axis=-1)
+        has_size = (span_m >= limits[0]) & (span_m <= limits[1])
+        if self._rules.any_size and not len(spans_m):
+            has_size |= crossed.span_ratio < SIZE_RATIO
         size_m = crossed.span_m[:, [0, 0, 1]]
         # A known drone of unknown size is taken to be as large as the candidate.
         known_size_m = np.where(np.isfinite(known.size_m), known.size_m, size_m[:, None])
@@ -419,8 +425,7 @@ class Births:
         better = np.linalg.norm(points_m[:, None] - points_m, axis=-1) < SEPARATION_M
         better &= seen.sum(axis=-1) > seen.sum(axis=-1)[:, None]
         return (
-            (span_m >= limits[0])
-            & (span_m <= limits[1])
+            has_size
             & (apart >= MIN_DISTANCE)
             & ((self._num_viewpoints(whole) >= 2) | (len(spans_m) == 0))
             & ((crossed.ambiguity < AMBIGUOUS) | (crossed.num_viewpoints >= TRUSTED_VIEWPOINTS))

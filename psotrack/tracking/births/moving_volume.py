@@ -6,7 +6,7 @@ of frames, drones are therefore looked for in a region so wide that no drone is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -153,7 +153,12 @@ def _extended(rig: Rig, room_m: Float[np.ndarray, "2 3"], points: MovingPoints) 
 
 
 def moving_points(
-    rig: Rig, found: Sightings | Silhouettes, fps: float, size_m: tuple[float, ...] | None = None
+    rig: Rig,
+    found: Sightings | Silhouettes,
+    fps: float,
+    size_m: tuple[float, ...] | None = None,
+    *,
+    any_size: bool = False,
 ) -> MovingPoints:
     """Points that move, in windows that are spread over the frames: drones that are born there.
 
@@ -163,14 +168,15 @@ def moving_points(
             two viewpoints have detections; of silhouettes, anywhere.
         fps: frames per second.
         size_m: full lengths of the drones, metres, where they are given.
+        any_size: whether all sizes count (see `BirthRules`).
     """
-    frames, rules = np.arange(found.num_frames), BirthRules(size_m=size_m)
+    frames, rules = np.arange(found.num_frames), BirthRules(size_m=size_m, any_size=any_size)
     if isinstance(found, Sightings):
         seen, viewpoint = np.isfinite(found.noise_px).any(axis=-1), viewpoints(rig.cameras)
         by_viewpoint = [seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)]
         frames = np.flatnonzero(np.sum(by_viewpoint, axis=0) >= 2)
         # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
-        rules = BirthRules(2, size_m=size_m)
+        rules = replace(rules, min_viewpoints=2)
     step = max(1, round(STEP_S * fps))
     last = 0 if not len(frames) else int(frames[-1])
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera
-from psotrack.settings import TrackSettings
+from psotrack.settings import BLOBS, TrackSettings
 from psotrack.support import Report, as_written, no_progress
 from psotrack.tracking.births import (
     NEW,
@@ -109,6 +109,7 @@ class _Tracker:
                 settings.status.min_cameras_to_begin,
                 num_frames=sightings.num_frames,
                 size_m=settings.drones.size_m,
+                any_size=settings.detections != BLOBS,
             ),
         )
         self._max_coasting_frames = round(settings.status.max_coasting_s * fps)

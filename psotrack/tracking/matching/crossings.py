@@ -61,6 +61,7 @@ class Crossings:
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
         span_m: (crossings, 2), width and height of the detections at that distance, median of the cameras, metres.
+        span_ratio: (crossings,), ratio of the cameras' largest and smallest spans, each its longer side.
         place_px, noise_px: (crossings, cameras, 2) and (crossings, cameras), middles of the detections that count and
             their standard deviations, pixels; NaN for other cameras.
         ambiguity: (crossings,), likelihood of another assignment of the detections (see `Matches`).
@@ -74,6 +75,7 @@ class Crossings:
     box: Int[np.ndarray, "crossings cameras"]
     disagreement: Float[np.ndarray, "crossings"]
     span_m: Float[np.ndarray, "crossings 2"]
+    span_ratio: Float[np.ndarray, "crossings"]
     place_px: Float[np.ndarray, "crossings cameras 2"]
     noise_px: Float[np.ndarray, "crossings cameras"]
     ambiguity: Float[np.ndarray, "crossings"]
@@ -171,6 +173,7 @@ def crossings(
     squared = np.where(seen, lines.reprojection_px[kept] / noise_px[kept], 0.0) ** 2
     span_m = sizes_m(cameras, np.asarray(to_camera(cameras, position_m[:, None])), size_px[kept])
     span_m = np.where(seen[..., None], span_m, np.nan)
+    longer_m = span_m.max(axis=-1)
     return Crossings(
         expected=groups.expected[kept],
         position_m=position_m,
@@ -180,6 +183,7 @@ def crossings(
         box=groups.detection[kept],
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
+        span_ratio=np.nanmax(longer_m, axis=1) / np.nanmin(longer_m, axis=1),
         place_px=np.where(seen[..., None], centre_px[kept], np.nan),
         noise_px=np.where(seen, noise_px[kept], np.nan),
         ambiguity=groups.ambiguity[kept],
