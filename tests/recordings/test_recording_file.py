@@ -197,6 +197,15 @@ def test_a_rig_file_and_own_keys_that_override_it(folder, name):
     np.testing.assert_allclose(turns, given.cameras.T_cam_world[:, :3, :3])
 
 
+def test_a_camera_without_a_name_in_the_rig_file_is_named(folder, caplog):
+    write_rig(folder / "rig.toml", ring_rig(2, image_size_wh=(64, 48)))
+    videos = (camera("c0", 'video = "left.avi"'), camera("K2", 'video = "right.avi"'))
+    assert open_recording(write_recording(folder, *videos, top='calibration = "rig.toml"')).rig.names == (
+        "c0",
+    )
+    assert "no place of camera K2 in rig.toml, whose c1 is of no camera of the recording; " in caplog.text
+
+
 def test_a_file_that_states_no_sizes_gets_those_of_the_videos(folder):
     given = open_recording(write_recording(folder, LEFT, WIDE)).rig
     # The layout of the dataset has one focal length, and no skew.
@@ -470,6 +479,13 @@ def another_size(folder):
     write_rig(folder / ANY / "rig.toml", ring_rig(1, image_size_wh=(128, 96)))
 
 
+def other_names(folder):
+    toml("calibration = 'rig.toml'\n[cameras.K1]\nvideo = 'left.avi'\n[cameras.K2]\nvideo = 'right.avi'\n")(
+        folder
+    )
+    write_rig(folder / ANY / "rig.toml", ring_rig(2, image_size_wh=(64, 48)))
+
+
 def opened(name=ANY):
     return lambda folder: open_recording(folder / name)
 
@@ -486,6 +502,8 @@ NO_RECORDINGS = {
     "the folder above": (write("flights/late/recording.toml", ""), opened("flights"), "did you mean ", "flights/late?"),
     "no place": (toml(f"[cameras.left]\nvideo = 'left.avi'\nK = {K}"), usable,
                  "lens and place are known, found none for left; ", " calibrate rig"),
+    "names of another rig": (other_names, opened(), "calibration: expected a camera of the recording, K1, K2, in rig.toml"
+                             ", found only c0, c1; `psotrack init --force --match CAMERA=FILE` maps them"),
     "a stream": (toml(f"{LEFT.replace('left.avi', 'rtsp://left/1')}size = [64, 48]\n"), usable,
                  "camera left: expected a video file, found the stream rtsp://left/1"),
     "another size than calibrated": (another_size, usable, "128 x 96 pixels as calibrated, found 64 x 48 ", "by 1/2"),

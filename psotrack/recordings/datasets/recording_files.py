@@ -314,7 +314,7 @@ def _calibrated(
         return {}
     stated = read_cameras(_existing(path.parent, content.calibration, path, "calibration"))
     known = {name: chosen_camera(name, tuple(stated)) for name in content.cameras}
-    _check_one_each(path, known)
+    _check_names(path, content, known, tuple(stated))
     sizes = {own: sizes_wh[name] or stated[own].size_wh for name, own in known.items() if own}
     entries = entries_of(
         {own: stated[own] for own, size_wh in sizes.items() if size_wh},
@@ -324,8 +324,14 @@ def _calibrated(
     return {name: entries[own] for name, own in known.items() if own in entries}
 
 
-def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
-    """Raise `InputError` where two cameras of the recording are one camera of the rig file."""
+def _check_names(
+    path: Path, content: RecordingFile, known: Mapping[str, str | None], stated: Sequence[str]
+) -> None:
+    """Check whose the cameras of the rig file are: two cameras are not one of them, and not all are unknown.
+
+    Raises:
+        InputError: the names do not fit; a camera without a place is only a warning.
+    """
     taken: dict[str, str] = {}
     for name, entry in known.items():
         if entry is not None and entry in taken:
@@ -333,6 +339,20 @@ def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
             raise file_error(path, f"cameras.{name}", expected, f"{entry} for {taken[entry]} as well")
         if entry is not None:
             taken[entry] = name
+    alone = [name for name, entry in known.items() if entry is None and content.cameras[name].K is None]
+    unused = [entry for entry in stated if entry not in taken]
+    rig_file, remedy = (
+        Path(content.calibration or "").name,
+        "`psotrack init --force --match CAMERA=FILE` maps them",
+    )
+    if alone and not taken:
+        expected = f"a camera of the recording, {', '.join(known)}, in {rig_file}"
+        raise file_error(path, "calibration", expected, f"only {', '.join(stated)}", remedy)
+    if alone and unused:
+        _logger.warning(
+            "%s: no place of camera %s in %s, whose %s is of no camera of the recording; %s",
+            path, ", ".join(alone), rig_file, ", ".join(unused), remedy,
+        )  # fmt: skip
 
 
 def _camera(
