@@ -312,7 +312,7 @@ def test_easymocaps_rodrigues_vectors_count_and_sizes_of_zero_are_not_known(tmp_
 
 @pytest.mark.parametrize("upwards", [False, True])
 @pytest.mark.parametrize("separator", [",", "\t", "  "])
-def test_dlt_coefficients(tmp_path, upwards, separator):
+def test_dlt_coefficients(tmp_path, run_psotrack, upwards, separator):
     """The third camera has the world's origin behind it, and is turned round."""
     behind = look_at((1.0, 0.0, 0.5), (3.0, 0.2, 0.7))
     to_file = np.array([[1.0, 0, 0], [0, -1, 720], [0, 0, 1]]) if upwards else np.eye(3)
@@ -335,6 +335,21 @@ def test_dlt_coefficients(tmp_path, upwards, separator):
         np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), rtol=0, atol=1e-6)
     np.testing.assert_allclose(rig.cameras.T_cam_world[2, :3], np.column_stack(behind), atol=1e-9)
     if separator == ",":
+        # With the lenses of another file the rig is that of the pixels before they were undistorted.
+        argus = "".join(
+            f"{number} 900 1280 720 640 360 1 -0.1 0.02 0 0 {0.01 * number}\n" for number in (3, 2, 1)
+        )
+        (tmp_path / "argus.txt").write_text(argus)
+        words = ("calibrate", "convert", path, tmp_path / "rig.toml", "--units", "m", "--size", "1280,720")
+        assert run_psotrack(*words, "--distortion", tmp_path / "argus.txt", "--force").code == 0
+        lenses = read_rig(tmp_path / "rig.toml").cameras
+        np.testing.assert_allclose(lenses.K, rig.cameras.K, atol=1e-9)
+        np.testing.assert_allclose(
+            lenses.dist, [[-0.1, 0.02, 0, 0, 0.01 * number] for number in (1, 2, 3)], atol=1e-12
+        )
+        (tmp_path / "argus.txt").write_text(argus[: argus.index("1 900")])
+        refused = partial(run_psotrack, *words, "--force", "--distortion", tmp_path / "argus.txt")
+        assert_refused(refused, "argus.txt", "cam1", unchanged=tmp_path)
         path.write_text("a,b,c\n" + path.read_text())
         with_header = read_rig(path, SIZE_WH, metres_per_unit=1.0)
         assert with_header.names == ("a", "b", "c")

@@ -502,8 +502,8 @@ NO_RECORDINGS = {
     "the folder above": (write("flights/late/recording.toml", ""), opened("flights"), "did you mean ", "flights/late?"),
     "no place": (toml(f"[cameras.left]\nvideo = 'left.avi'\nK = {K}"), usable,
                  "lens and place are known, found none for left; ", " calibrate rig"),
-    "names of another rig": (other_names, opened(), "calibration: expected a camera of the recording, K1, K2, in rig.toml"
-                             ", found only c0, c1; `psotrack init --force --match CAMERA=FILE` maps them"),
+    "names of another rig": (other_names, opened(), "calibration: expected a camera of the recording, K1, K2, in rig.t",
+                             "found only c0, c1; `psotrack init --force --match CAMERA=FILE` maps them"),
     "a stream": (toml(f"{LEFT.replace('left.avi', 'rtsp://left/1')}size = [64, 48]\n"), usable,
                  "camera left: expected a video file, found the stream rtsp://left/1"),
     "another size than calibrated": (another_size, usable, "128 x 96 pixels as calibrated, found 64 x 48 ", "by 1/2"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from psotrack.cli.commands import command
 from psotrack.cli.output import Output
 from psotrack.cli.types import says
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, errors_name
 from psotrack.support import POSITION, format_numbers
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def convert(
     to: Annotated[str | None, says(metavar="NAME")] = None,
     lenses: bool = False,
     undistorted: bool = False,
+    distortion: Annotated[Path | None, says(metavar="FILE")] = None,
 ) -> None:
     """Convert the calibration IN, of any program in the list below, to OUT.
 
@@ -42,6 +43,7 @@ def convert(
     Examples:
       psotrack calibrate convert calibration.toml rig.toml --units mm
       psotrack calibrate convert cameras_calibration.csv rig.yml --size 1920,1080
+      psotrack calibrate convert dltcoefs.csv rig.toml --units m --size 1920,1080 --distortion lenses.txt
 
     Options:
         size: size of the images in pixels, if the calibration file does not contain the size.
@@ -50,6 +52,8 @@ def convert(
         to: format of OUT. None: by the name of OUT.
         lenses: convert only the lenses; IN need not have poses.
         undistorted: set the distortion to zero: the videos are undistorted already.
+        distortion: calibration of any format whose distortion the cameras get, by name: for DLT coefficients of points
+            that were undistorted with it.
     """
     from psotrack.geometry import Rig
     from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_rig
@@ -61,6 +65,15 @@ def convert(
     else:
         metres = None if units is None else UNITS_M[units]
         rig = read_rig(source, size, metres_per_unit=metres, file_format=format)
+    if distortion is not None:
+        if undistorted or lenses:
+            raise SettingsError(
+                "--distortion", expected="neither --undistorted nor --lenses", found="one of them"
+            )
+        with errors_name(distortion):
+            own = read_lenses(distortion, size).select(rig.names).cameras
+        # The focal length stays: it is that with which the coefficients were found.
+        rig = Rig(rig.names, replace(rig.cameras, dist=own.dist, fisheye=own.fisheye))
     if undistorted:
         rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
     write_rig(out, rig, force=output.force, file_format=to, placed=not lenses)
