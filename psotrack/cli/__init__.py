@@ -28,6 +28,8 @@ _COMMANDS = {
     "Research": ["simulate", "sweep", "detect", "cache"],
     "On-board": ["onboard"],
 }
+#: Loggers of Python's warnings and of libraries.
+_FOR_DEVELOPERS = ("py.warnings", "trimesh")
 _COMPLETION_VARIABLE = "_PSOTRACK_COMPLETE"
 
 
@@ -56,6 +58,10 @@ def cli(verbose: bool) -> None:
     level = logging.INFO if verbose else logging.WARNING
     # A log file takes more than stderr.
     handler.setLevel(level)
+    # Warnings of Python and of libraries are for developers: what a user must know is said in the package's own words.
+    logging.captureWarnings(True)
+    if not verbose:
+        handler.addFilter(lambda record: record.name not in _FOR_DEVELOPERS)
     logging.basicConfig(
         level=level,
         format="%(levelname)s %(name)s: %(message)s" if verbose else "psotrack: %(levelname)s: %(message)s",

@@ -56,6 +56,22 @@ def commands_of(group: click.Group, typed: str) -> Iterator[tuple[str, click.Com
             yield words, command
 
 
+#: Lists the scenarios; meanwhile NumPy, a library and psotrack warn.
+WARN = """
+import logging, sys
+import numpy as np
+from psotrack import cli
+invoke = cli.cli.invoke
+def warning(context):
+    invoke(context)
+    np.nanmean([np.nan])
+    logging.getLogger("trimesh").warning("of a mesh")
+    logging.getLogger("psotrack.any").warning("of psotrack")
+cli.cli.invoke = warning
+cli.main()
+"""
+
+
 EVERY_COMMAND = dict(commands_of(cli.cli, "psotrack"))
 
 
@@ -118,6 +134,19 @@ def test_help_and_names_of_commands_import_no_heavy_package() -> None:
     lines = result.stdout.splitlines()
     assert lines[:3] == ["", "", ""]
     assert lines[3:] == ["msgspec"] * len(with_settings)
+
+
+def test_warnings_of_libraries_are_for_the_log_and_verbose(tmp_path: Path) -> None:
+    """In this process all warnings are errors, in all commands of all tests."""
+
+    def said(*words: object) -> str:
+        command = [sys.executable, "-c", WARN, *map(str, words), "simulate", "--list"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stderr
+
+    assert said() == "psotrack: warning: of psotrack\n"
+    of_all = said("--verbose")
+    for words in ("RuntimeWarning: Mean of empty slice", "trimesh: of a mesh", "psotrack.any: of psotrack"):
+        assert words in of_all
 
 
 # --- completion
