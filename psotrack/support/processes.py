@@ -32,8 +32,8 @@ _PROGRESS_S = 0.1
 #: Time that they have after that to remove their temporary files before they are killed, seconds.
 _CLEAN_UP_S = 5.0
 #: Variables of the workers, where the user has not set them. The workers are as many as the processors, so threads of
-#: NumPy's linear algebra would only wait. Memory of an image is kept for the next image (glibc's names), bytes. Python's
-#: warnings are for developers, who see them with one process.
+#: NumPy's linear algebra would only wait. Memory of an image is kept for the next image (glibc's names), bytes.
+#: Python's warnings are for developers, who see them with one process.
 _VARIABLES = {
     "OPENBLAS_NUM_THREADS": "1",
     "PYTHONWARNINGS": "ignore",
