@@ -148,14 +148,15 @@ def test_a_clock_that_runs_fast_is_found():
 
 
 @pytest.mark.parametrize(
-    ("cameras", "camera", "frame", "count"), [(5, 2, 140, 1), (5, 4, 170, 3), (2, 1, 130, 1)]
+    ("cameras", "camera", "frame", "count", "frames"),
+    [(5, 2, 140, 1, 300), (5, 4, 170, 3, 300), (2, 1, 130, 1, 300), (5, 0, 70, 1, 140)],
 )
-def test_lost_frames_are_a_step_at_their_frame_and_no_drift(cameras, camera, frame, count):
+def test_lost_frames_are_a_step_at_their_frame_and_no_drift(cameras, camera, frame, count, frames):
     """Found: a line through the offsets, by which most frames were off by up to half the step."""
-    rig, number = RIG.select(RIG.names[:cameras]), np.arange(300)
-    given = alike(300, rig.names)
+    rig, number = RIG.select(RIG.names[:cameras]), np.arange(frames)
+    given = alike(frames, rig.names)
     lost = {RIG.names[camera]: FrameTimes.listed((number + count * (number >= frame)) / FPS)}
-    shown, timeline = sightings_of(alike(300) | lost), make_timeline(given)
+    shown, timeline = sightings_of(alike(frames) | lost), make_timeline(given)
     shown = Sightings(shown.centre_px[:, :cameras], shown.size_px[:, :cameras], shown.noise_px[:, :cameras])
     found = clocks_of_tracks(rig, shown, timeline, tracked(timeline))
     (of_camera,) = found.lost

@@ -43,6 +43,8 @@ _CLEARLY = 5.0
 _KNOWN = 0.25
 #: A step is a whole number of the camera's frames, up to this share of one; and largest number of steps that are found.
 _WHOLE, _MOST_STEPS = 0.25, 6
+#: Least number of stretches that tell a step from a drift; a shorter recording has shorter ones.
+_STRETCHES_OF_STEP = 4
 
 
 @dataclass(frozen=True)
@@ -284,16 +286,21 @@ def estimate_clocks(
         timeline: the instants.
     """
     lost: list[LostFrames] = []
-    stretches = _offsets_of_stretches(rig, points_px, timeline)
-    while (
-        len(lost) < _MOST_STEPS and (found := _lost_frames(rig, points_px, timeline, stretches)) is not None
-    ):
+    of_step = min(_LEAST_INSTANTS, len(points_px) // _STRETCHES_OF_STEP)
+    is_long = of_step >= _LEAST_INSTANTS // 2
+    while True:
+        stretches = searched = _offsets_of_stretches(rig, points_px, timeline, _LEAST_INSTANTS)
+        found = None
+        if is_long and len(lost) < _MOST_STEPS:
+            if of_step < _LEAST_INSTANTS:
+                searched = _offsets_of_stretches(rig, points_px, timeline, of_step)
+            found = _lost_frames(rig, points_px, timeline, searched)
+        if found is None:
+            clocks = fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
+            return replace(clocks, lost=tuple(lost))
         row, frames = found
         points_px = _as_exposed(points_px, timeline, frames.camera, row, frames.step_s)
         lost.append(frames)
-        stretches = _offsets_of_stretches(rig, points_px, timeline)
-    clocks = fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
-    return replace(clocks, lost=tuple(lost))
 
 
 #: Middle of each stretch, offsets of the cameras in it and their standard deviations, seconds.
@@ -305,10 +312,10 @@ _Stretches = tuple[
 
 
 def _offsets_of_stretches(
-    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline
+    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline, least: int
 ) -> _Stretches:
-    """Constant offsets in each of several stretches."""
-    num_stretches = int(np.clip(len(points_px) // _LEAST_INSTANTS, 1, _MOST_STRETCHES))
+    """Constant offsets in each of several stretches of at least so many instants."""
+    num_stretches = int(np.clip(len(points_px) // least, 1, _MOST_STRETCHES))
     parts = np.array_split(np.arange(len(points_px)), num_stretches)
     estimates = [
         camera_offsets(rig, points_px[part], timeline.rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
