@@ -12,7 +12,7 @@ from .image_points import (
 from .lens_models import LensModel, known_lenses, lens_of_view, parse_lens_model
 from .pnp import Solver, ray_distances, solve_pnp, solve_pnp_ransac
 from .residuals import GATE, inflation, spread_px
-from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
+from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, start_lenses
 from .rig.by_board import calibrate_by_board
 from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
@@ -25,7 +25,7 @@ from .rig.findings import (
     say_searched,
     worst_views,
 )
-from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
+from .rig.images import CameraImages, choose_instants, instants_of_numbers, open_images, open_recorded
 from .rig.lenses import choose_lens_model
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.point_files import (
@@ -77,6 +77,7 @@ __all__ = [
     "calibrate_by_moving_point",
     "calibrate_by_point",
     "calibrate_rig",
+    "choose_instants",
     "choose_lens_model",
     "covariance_of_centres",
     "coverage",
@@ -108,6 +109,7 @@ __all__ = [
     "solve_pnp",
     "solve_pnp_ransac",
     "spread_px",
+    "start_lenses",
     "stick_length",
     "summed",
     "views_of_detections",

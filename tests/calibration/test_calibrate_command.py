@@ -24,7 +24,8 @@ from board_rigs import (
 from clock_worlds import random_motion, simulate_estimate, simulate_reference
 from helpers import assert_refused, make_once, ring_rig
 from marker_worlds import draw_markers, marker_at
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 import psotrack as pt
 from psotrack.calibration import (
@@ -175,6 +176,39 @@ def test_any_frame_of_a_long_video_may_be_the_floor(calibrate, tmp_path):
     assert "left 154 of 306, right 154 of 306" in said
     found = read_rig(out).cameras.T_cam_world[0]
     np.testing.assert_allclose(found[:3, 3], poses["left"][2, :3, 3], atol=0.01)
+
+
+@pytest.mark.slow
+def test_videos_of_a_board_that_begin_at_different_times(calibrate, run_psotrack, tmp_path):
+    """More than 300 frames are not all searched; a rig of a video that plays backwards is not written."""
+    knots = {name: poses[[0, 2, 5, 6, 8]] for name, poses in poses_by_two_cameras(9).items()}
+    time = np.linspace(0, 4, 340)
+    for name, few in knots.items():
+        smooth = np.tile(np.eye(4), (len(time), 1, 1))
+        smooth[:, :3, :3] = RotationSpline(np.arange(5), Rotation.from_matrix(few[:, :3, :3]))(
+            time
+        ).as_matrix()
+        smooth[:, :3, 3] = CubicSpline(np.arange(5), few[:, :3, 3])(time)
+        film_board(tmp_path / f"{name}.avi", smooth[:315] if name == "left" else smooth[25:])
+    film_board(tmp_path / "back.avi", smooth[::-1])
+    out, lens = tmp_path / "rig.toml", ("--lens", "0", "--out")
+    said = calibrate("rig", tmp_path / "left.avi", tmp_path / "right.avi", *STATED, *lens, out)
+    assert (
+        "right begins 25 frames later than left, as the board moves: its frame 0 is of the instant of" in said
+    )
+    np.testing.assert_allclose(read_rig(out).cameras.centre_world, [[0, 0, 0], [0.1, 0, 0]], atol=0.005)
+    wrong = (
+        "calibrate",
+        "rig",
+        tmp_path / "left.avi",
+        tmp_path / "back.avi",
+        *STATED,
+        *lens,
+        tmp_path / "no.toml",
+    )
+    words = "expected a rig that fits the board's views to 0.5 % of the images' width, found medians of "
+    assert_refused(lambda: run_psotrack(*wrong), words, "--force writes", unchanged=tmp_path)
+    assert run_psotrack(*wrong, "--force").code == 0
 
 
 @pytest.mark.slow

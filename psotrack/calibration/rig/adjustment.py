@@ -37,7 +37,7 @@ from psotrack.calibration.bundle import (
 )
 from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.residuals import GATE, centre_by_pose
-from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
+from psotrack.calibration.rig.chain import Chain, join_cameras
 from psotrack.calibration.rig.lenses import LEAST_VIEWS, MOST_FITS, choose_lens_model, find_lens
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
@@ -106,10 +106,12 @@ class LensChoice:
     Attributes:
         model: model of the lenses that are not known; None to choose it for each camera by views left out.
         known: lenses by camera name, which are kept.
+        start: lenses of all cameras by name from which the adjustment starts (see `start_lenses`); None to find them.
     """
 
     model: LensModel | None = field(default_factory=LensModel)
     known: Mapping[str, tuple[LensModel, np.ndarray]] | None = None
+    start: Mapping[str, tuple[LensModel, np.ndarray]] | None = None
 
 
 def calibrate_rig(
@@ -134,9 +136,9 @@ def calibrate_rig(
         InputError: a camera sees too little of the board, no views join the cameras, the views do not determine the
             rig, or the board is not seen at the instant `floor`.
     """
-    _check_views(board, views, lenses)
     fixed = None if floor is None else _instant(views, floor)
-    models, vectors = _start_lenses(board, views, lenses, report)
+    start = lenses.start or start_lenses(board, views, lenses, report)
+    models, vectors = zip(*(start[name] for name in views.names), strict=True)
     chain = join_cameras(board, views, models, vectors)
     views = _relabelled(board, views, chain)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
@@ -157,26 +159,30 @@ def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
                 found=f"{count}",
                 remedy="film the board nearer, or pass the camera's lens with --lenses",
             )
-    check_joined(views)
 
 
-def _start_lenses(
-    board: Board, views: BoardViews, lenses: LensChoice, report: Report
-) -> tuple[tuple[LensModel, ...], tuple[np.ndarray, ...]]:
-    """Models and first vectors of the lenses."""
+def start_lenses(
+    board: Board, views: BoardViews, lenses: LensChoice, report: Report = no_progress
+) -> dict[str, tuple[LensModel, np.ndarray]]:
+    """Models and first vectors of the lenses, by camera name, from the views of each camera alone.
+
+    Arguments: see `calibrate_rig`.
+
+    Raises:
+        InputError: a camera sees too little of the board, or no lens fits its views.
+    """
+    _check_views(board, views, lenses)
     known = lenses.known or {}
-    models, vectors = [], []
+    start = {}
     steps = (0 if lenses.model else MOST_FITS) + 1
     with report("lenses", steps * sum(name not in known for name in views.names)) as advance:
         for camera, name in enumerate(views.names):
             if name in known:
-                model, vector = known[name]
+                start[name] = known[name]
             else:
-                model, vector = _first_lens(board, views, camera, lenses.model, advance)
+                start[name] = _first_lens(board, views, camera, lenses.model, advance)
                 advance(1)
-            models.append(model)
-            vectors.append(vector)
-    return tuple(models), tuple(vectors)
+    return start
 
 
 def _check_lens(found: CalibratedRig) -> None:

@@ -4,31 +4,54 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from psotrack.calibration.board_recognition import describe_board, detect_board
 from psotrack.calibration.boards import Board
 from psotrack.calibration.lens_models import known_lenses, parse_lens_model
-from psotrack.calibration.rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
+from psotrack.calibration.rig.adjustment import (
+    CalibratedRig,
+    LensChoice,
+    calibrate_rig,
+    in_new_world,
+    start_lenses,
+)
 from psotrack.calibration.rig.findings import (
     RigCalibration,
     advise,
     figures_of,
+    say_misfit,
     say_print,
     say_searched,
+    say_starts,
     worst_views,
 )
-from psotrack.calibration.rig.images import first_images, instants_of_numbers, open_images, open_recorded
+from psotrack.calibration.rig.images import (
+    CameraImages,
+    Instants,
+    choose_instants,
+    first_images,
+    instants_of_numbers,
+    open_images,
+    open_recorded,
+)
 from psotrack.calibration.rig.point_files import fit_world, read_world, world_in_words
 from psotrack.calibration.rig.settings import RigSettings
-from psotrack.calibration.rig.views import find_views
+from psotrack.calibration.rig.shifts import find_board_shifts
+from psotrack.calibration.rig.views import FoundBoards, find_views
 from psotrack.errors import errors_name
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings.datasets import is_recording, open_recording
 from psotrack.support import POSITION, Report, format_numbers, no_progress
 
 _logger = logging.getLogger(__name__)
+
+#: Largest number of times that the views are found: after two shifts the frames are the right ones.
+_MOST_ROUNDS = 3
 
 _HEADINGS = ("camera", "views", "rms (px)", "f (px)", POSITION, "std (mm)")
 
@@ -49,10 +72,10 @@ def calibrate_by_board(
     """
     given, lenses = None if settings.world is None else read_world(settings.world), _lens_choice(settings)
     if len(sources) == 1 and is_recording(sources[0]):
-        cameras, instants = open_recorded(open_recording(sources[0]), settings.floor)
+        cameras, instants = open_recorded(open_recording(sources[0]))
     else:
         cameras = open_images(sources, settings.names)
-        instants = instants_of_numbers(cameras, settings.floor)
+        instants = instants_of_numbers(cameras)
     said = []
     if settings.squares is None:
         stated = detect_board(settings.square_m or 0.0, first_images(cameras, 4))
@@ -61,10 +84,11 @@ def calibrate_by_board(
     else:
         stated = Board.of(settings)
     with errors_name(f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else sources[0]):
-        found = find_views(stated, cameras, instants, report)
+        found, lenses, shifts = _find_views(stated, cameras, instants, lenses, settings.floor, report)
         every = {camera.name: len(camera.frames) for camera in cameras}
         searched = zip(found.views.names, found.searched.tolist(), strict=True)
         said += say_searched({name: (count, every[name]) for name, count in searched})
+        said += say_starts(found.views.names, shifts)
         calibrated = calibrate_rig(found.board, found.views, lenses, floor=settings.floor, report=report)
     if given is not None:
         with errors_name(given.path):
@@ -75,10 +99,39 @@ def calibrate_by_board(
     else:
         first = calibrated.rig.names[0]
         place = f"camera {first}: x right, y down, z forward; --floor and --world place it elsewhere"
-    return _result(calibrated, said, say_print(found), place)
+    begins = {name: -shift for name, shift in zip(found.views.names, shifts, strict=True)}
+    return _result(calibrated, said, say_print(found), place, begins)
 
 
-def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], world: str) -> RigCalibration:
+def _find_views(
+    board: Board,
+    cameras: Sequence[CameraImages],
+    instants: Instants,
+    lenses: LensChoice,
+    floor: int | None,
+    report: Report,
+) -> tuple[FoundBoards, LensChoice, list[int]]:
+    """Views of the board at instants that are counted as its motion says.
+
+    Also the lenses from which an adjustment starts, and at how many instants later each camera shows what the first
+    one shows.
+    """
+    shifts = np.zeros(len(cameras), np.int64)
+    for _ in range(_MOST_ROUNDS):
+        found = find_views(board, cameras, choose_instants(instants, floor, shifts.tolist()), report)
+        if lenses.start is None:
+            lenses = replace(lenses, start=start_lenses(found.board, found.views, lenses, report))
+        # A shift that is found between searched frames is looked at once more where it has these frames.
+        more = find_board_shifts(found.board, found.views, lenses.start or {})
+        if not more.any():
+            break
+        shifts += more
+    return found, lenses, shifts.tolist()
+
+
+def _result(
+    calibrated: CalibratedRig, said: list[str], printed: list[str], world: str, begins: Mapping[str, int]
+) -> RigCalibration:
     """The figures of the cameras, the views that fit worst, and what to do.
 
     Args:
@@ -86,6 +139,7 @@ def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], worl
         said: sentences on the board, and on which frames were searched for it.
         printed: sentences on how the board was printed and seen.
         world: what the world is.
+        begins: by how many frames each camera begins after the first one.
     """
     figures, worst, advice = figures_of(calibrated), worst_views(calibrated), advise(calibrated)
     rows = [
@@ -102,6 +156,7 @@ def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], worl
     models = ", ".join(f"{name} {row['lens']}" for name, row in figures.items())
     more = {
         "print": printed,
+        "begins": dict(begins),
         "worst_views": [dict(zip(("camera", "frame", "residual_px"), view, strict=True)) for view in worst],
         "advice": advice,
         "world": world,
@@ -113,7 +168,14 @@ def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], worl
         f"the world is {world}",
     ]
     return RigCalibration(
-        calibrated.rig, figures, (_HEADINGS, rows), [*said, *printed], after, more, calibrated
+        calibrated.rig,
+        figures,
+        (_HEADINGS, rows),
+        [*said, *printed],
+        after,
+        more,
+        calibrated,
+        misfit=say_misfit(figures),
     )
 
 

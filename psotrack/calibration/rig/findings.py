@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.calibration.rig.adjustment import CalibratedRig
-from psotrack.calibration.rig.shifts import find_board_shifts
 from psotrack.calibration.rig.views import FoundBoards
 from psotrack.geometry import Rig
 from psotrack.support import html_block, html_table, save_figure, text_table
@@ -30,6 +29,9 @@ _SHARED = 12
 _FOCAL_STD = 0.005
 #: A camera's views slip if the residuals are larger by this factor, and by this many pixels, than within the views.
 _SLIP_FACTOR, _SLIP_PX = 2.0, 0.3
+#: Largest median residual of a camera that fits, as a fraction of the image's longer side: ten pixels of 1920. Cameras
+#: whose frames are half an interval apart are within half of it, if the board is moved by hand.
+_MISFIT = 0.005
 #: Largest number of pictures in a row.
 _PICTURES = 4
 #: Residuals from this multiple of the median residual on have the brightest colour.
@@ -50,6 +52,7 @@ class RigCalibration:
         after: sentences below the table.
         more: what JSON has besides the cameras.
         calibrated: how the rig fits each view of a board; None without a board.
+        misfit: what does not fit the rig, which is then not written without `force`; empty where it fits.
         path: file of the rig; None where it is not written.
     """
 
@@ -60,6 +63,7 @@ class RigCalibration:
     after: Sequence[str] = ()
     more: Mapping[str, Any] = field(default_factory=dict)
     calibrated: CalibratedRig | None = None
+    misfit: str = ""
     path: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -154,6 +158,30 @@ def say_searched(searched: Mapping[str, tuple[int, int]]) -> list[str]:
     return [f"frames that were searched for the board, evenly spread: {', '.join(fewer)}"] if fewer else []
 
 
+def say_starts(names: Sequence[str], shifts: Sequence[int]) -> list[str]:
+    """Sentences on cameras that begin at another time than the first one, by the board's motion.
+
+    Args:
+        names: names of the cameras.
+        shifts: at how many frames later each camera shows what the first one shows.
+    """
+    return [
+        f"{name} begins {abs(shift)} frames {'earlier' if shift > 0 else 'later'} than {names[0]}, as the board moves: "
+        f"its frame {max(shift, 0)} is of the instant of frame {max(-shift, 0)} of {names[0]}"
+        for name, shift in zip(names, shifts, strict=True)
+        if shift
+    ]
+
+
+def say_misfit(figures: Mapping[str, Mapping[str, Any]]) -> str:
+    """Cameras whose views the rig does not fit, and by how much; empty where it fits all of them."""
+    return ", ".join(
+        f"{row['median_px']:.1f} px in {name}"
+        for name, row in figures.items()
+        if row["median_px"] > _MISFIT * max(row["image_size_wh"])
+    )
+
+
 def say_print(found: FoundBoards) -> list[str]:
     """Sentences on how the board was printed and seen."""
     sentences = []
@@ -199,7 +227,7 @@ def advise(calibrated: CalibratedRig) -> list[str]:
     for words, cameras in named.items():
         if cameras:
             sentences.append(words.format(", ".join(f"{name} ({value})" for name, value in cameras.items())))
-    return [*sentences, *map(str, find_board_shifts(calibrated))]
+    return sentences
 
 
 def save_coverage(path: Path, calibrated: CalibratedRig, *, force: bool) -> None:

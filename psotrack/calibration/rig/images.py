@@ -1,6 +1,7 @@
 """Images of several cameras, and which of them belong to one instant.
 
-A camera's images are a video, or image files that have numbers in their names. Frames of equal number are one instant.
+A camera's images are a video, or image files that have numbers in their names. Frames of equal number are one instant;
+of names that are times, such as nanoseconds, the nearest ones.
 """
 
 from __future__ import annotations
@@ -30,6 +31,12 @@ from psotrack.recordings import (
 _PATTERN = re.compile(r"[*?\[]")
 #: Largest number of instants in which the board is searched; limits the time for long videos.
 MOST_INSTANTS = 300
+#: Seconds since 1970, or since the start, with decimals, at the end of an image's name, as TUM's recordings have.
+_SECONDS = re.compile(r"(\d{9,})\.(\d+)$")
+#: Smallest number in the names of images that is a time: no camera counts as many frames.
+_LEAST_TIME = 10**11
+#: Number of each instant, (instants,), and each camera's frame, (instants, cameras), -1 where it has none.
+Instants = tuple[Int[np.ndarray, " instants"], Int[np.ndarray, "instants cameras"]]
 #: Largest relative difference of the frame rates of videos whose frames are counted alike.
 _SAME_RATE = 0.005
 
@@ -103,14 +110,8 @@ def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None)
     return cameras
 
 
-def open_recorded(
-    recording: Recording, floor: int | None = None
-) -> tuple[tuple[CameraImages, ...], tuple[np.ndarray, np.ndarray]]:
+def open_recorded(recording: Recording) -> tuple[tuple[CameraImages, ...], Instants]:
     """Images of a recording's cameras, and which of their frames belong to one instant of its clock.
-
-    Args:
-        recording: the recording.
-        floor: number of an instant that is not left out of a long recording; None for no such instant.
 
     Returns:
         the images; and the number of each instant, (instants,), with each camera's frame, (instants, cameras), -1 where
@@ -130,33 +131,48 @@ def open_recorded(
         {each.name: each.times for each in recording.cameras if each.video and each.times},
         recording.timing.rate_hz,
     )
-    number = _spread(np.arange(timeline.num_instants), floor)
-    return cameras, (number, timeline.frame[number].astype(np.int64))
+    return cameras, (np.arange(timeline.num_instants), timeline.frame.astype(np.int64))
 
 
-def instants_of_numbers(
-    cameras: Sequence[CameraImages], floor: int | None = None
-) -> tuple[Int[np.ndarray, " instants"], Int[np.ndarray, "instants cameras"]]:
-    """Instants of frames of equal number, evenly spread if there are more than `MOST_INSTANTS`.
-
-    Args:
-        cameras: the images.
-        floor: number of a frame that is not left out; None for no such frame.
-
-    Returns:
-        numbers of the instants; and (instants, cameras), number of each camera's frame, -1 where it has none.
-    """
-    numbers = _spread(np.unique(np.concatenate([camera.frames for camera in cameras])), floor)
+def instants_of_numbers(cameras: Sequence[CameraImages]) -> Instants:
+    """Instants of frames of equal number; of frames that are named by times, those that are nearest to each other."""
+    if min(int(camera.frames[-1]) for camera in cameras) >= _LEAST_TIME:
+        return _nearest_in_time(cameras)
+    numbers = np.unique(np.concatenate([camera.frames for camera in cameras]))
     frames = np.stack([np.where(np.isin(numbers, camera.frames), numbers, -1) for camera in cameras], axis=1)
     return numbers, frames
 
 
-def _spread(numbers: Int[np.ndarray, " instants"], floor: int | None) -> Int[np.ndarray, " chosen"]:
-    """At most `MOST_INSTANTS` of increasing numbers, evenly spread, and the number `floor` if it is among them."""
+def _nearest_in_time(cameras: Sequence[CameraImages]) -> Instants:
+    """Frames of several cameras are one instant if they are within half an interval of the fastest camera."""
+    intervals = [np.median(np.diff(camera.frames)) for camera in cameras if len(camera.frames) > 1]
+    apart = min(intervals, default=0.0) / 2
+    instants: list[dict[int, int]] = []
+    for time, index in sorted((int(time), k) for k, camera in enumerate(cameras) for time in camera.frames):
+        if not instants or index in instants[-1] or time - min(instants[-1].values()) > apart:
+            instants.append({})
+        instants[-1][index] = time
+    frames = np.array([[each.get(index, -1) for index in range(len(cameras))] for each in instants])
+    return np.array([min(each.values()) for each in instants]), frames
+
+
+def choose_instants(instants: Instants, floor: int | None = None, shifts: Sequence[int] = ()) -> Instants:
+    """The instants in which the board is searched: at most `MOST_INSTANTS`, evenly spread.
+
+    Args:
+        instants: all of them.
+        floor: number of an instant that is not left out; None for no such instant.
+        shifts: for each camera, at how many instants later it shows what the others show; none for 0.
+    """
+    number, frames = instants
     # Multiples of a step are read without decoding all frames between them.
-    step = max(1, -(-len(numbers) // MOST_INSTANTS))
-    chosen = numbers[::step]
-    return chosen if floor is None else np.union1d(chosen, numbers[numbers == floor])
+    chosen = np.arange(len(number)) % max(1, -(-len(number) // MOST_INSTANTS)) == 0
+    chosen |= number == floor
+    frames = frames.copy()
+    for camera, shift in enumerate(shifts):
+        row = np.searchsorted(number, number + shift).clip(max=len(number) - 1)
+        frames[:, camera] = np.where(number[row] == number + shift, frames[row, camera], -1)
+    return number[chosen], frames[chosen]
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -193,10 +209,10 @@ def _open(name: str, path: Path) -> CameraImages:
         return CameraImages(name, path, video, np.arange(video.num_frames))
     numbered: dict[int, Path] = {}
     for file in files:
-        digits = re.findall(r"\d+", file.stem)
+        seconds, digits = _SECONDS.search(file.stem), re.findall(r"\d+", file.stem)
         if not digits:
             raise InputError(file, expected="a name with the number of the frame", found="no number")
-        number = int(digits[-1])
+        number = int(digits[-1]) if seconds is None else int(f"{seconds[1]}{seconds[2]:0<9.9}")
         if number in numbered:
             raise InputError(
                 file, expected="each number once", found=f"{number} as of {numbered[number].name}"

@@ -177,7 +177,7 @@ def read_world(path: Path | str) -> GivenWorld:
         InputError: the file cannot be read, or a column or a value is missing.
     """
     path = Path(path)
-    table = read_table(path, _SEPARATOR)
+    table = read_table(path, _SEPARATOR, has_gaps=True)
     if table.find("camera") is not None:
         marks = read_image_points(path)
         places = {

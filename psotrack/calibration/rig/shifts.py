@@ -1,32 +1,47 @@
 """Cameras whose frames are counted wrongly: their sightings fit what the other cameras see at other instants.
 
-What moves is elsewhere at another instant, so a camera whose frames are counted wrongly has no pose that fits. It is
-placed by its slowest sightings then, and the rest are left out as if they were of something else.
+What moves is elsewhere at another instant, so a camera whose frames are counted wrongly has no pose that fits. By a
+moving point it is placed by its slowest sightings then, and the rest are left out as if they were of something else. A
+board's motion is known to each camera alone, and tells the shift before any camera is placed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
+from psotrack.calibration.boards import Board
+from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.pnp import solve_pnp_ransac
-from psotrack.calibration.rig.adjustment import CalibratedRig
+from psotrack.calibration.rig.lenses import find_board_poses
 from psotrack.calibration.rig.moving_point import PointViews
+from psotrack.calibration.rig.views import BoardViews
 from psotrack.geometry import Rig, project, triangulate_linearly, undistort
+from psotrack.support import similarity
 
-#: Largest shift that is looked for, instants: two seconds of 30 per second.
+#: Largest shift of a moving point that is looked for, instants: two seconds of 30 per second.
 _MOST_SHIFT = 60
-#: Distance in the image up to which a moving point's sighting fits, pixels: ten times the error of a usual detector;
-#: and that of a board's corner: a camera that is counted wrongly pulls the boards by some pixels.
-_FITS_PX, _CORNER_FITS_PX = 5.0, 2.0
+#: Distance in the image up to which a moving point's sighting fits, pixels: ten times the error of a usual detector.
+_FITS_PX = 5.0
 #: A camera of whose sightings a larger fraction fits is sound.
 _SOUND = 0.6
 #: Least gain of the fraction that fits to tell a shift; clutter fits a few more sightings at any shift.
 _LEAST_GAIN = 0.2
 #: Smallest and largest number of sightings that are compared.
 _LEAST, _MOST = 24, 300
+#: Smallest number of instants that two cameras share at a shift of a board, and largest number of frames between two
+#: instants, half a second of 30 per second: a hand turns round within less.
+_LEAST_SHARED, _MOST_STEP = 12, 15
+#: Largest fraction of a board's motion that a shift leaves, and largest part of what no shift leaves. Errors
+#: of poses leave some hundredths, of a poor lens a tenth; a wrong shift leaves most.
+_EXPLAINED, _BETTER = 0.3, 0.5
+#: Rounds of a fit of two motions without outliers.
+_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -72,22 +87,122 @@ def find_point_shifts(rig: Rig, views: PointViews) -> list[Shift]:
         distance_px = np.linalg.norm(project(rig.cameras, points_m[:, None])[0] - others_px, axis=-1)
         disagree = np.any(distance_px > _FITS_PX, axis=1)
         points_m = np.where(disagree[:, None], np.nan, points_m)
-        shifts += _shift(rig, index, key, views.points_px[:, index], points_m, 2, _FITS_PX)
+        shifts += _shift(rig, index, key, views.points_px[:, index], points_m)
     return shifts
 
 
-def find_board_shifts(calibrated: CalibratedRig) -> list[Shift]:
-    """The same for cameras that see a board: the board is where the other cameras have it."""
-    views, rig, shifts, corners_m = calibrated.views, calibrated.rig, [], calibrated.board.corners_m
-    key = (views.number[:, None] * len(corners_m) + np.arange(len(corners_m))).ravel()
-    T = calibrated.T_world_board
-    points_m = np.einsum("vij,nj->vni", T[:, :3, :3], corners_m) + T[:, None, :3, 3]
-    for index in range(len(rig)):
-        known = np.any(np.delete(calibrated.used, index, axis=0), axis=(0, 2))
-        known_m = np.where(known[:, None, None], points_m, np.nan).reshape(-1, 3)
-        corners_px = views.corners_px[index].reshape(-1, 2)
-        shifts += _shift(rig, index, key, corners_px, known_m, len(corners_m), _CORNER_FITS_PX)
-    return shifts
+def find_board_shifts(
+    board: Board, views: BoardViews, lenses: Mapping[str, tuple[LensModel, np.ndarray]]
+) -> Int[np.ndarray, " cameras"]:
+    """At how many frames later each camera shows what the first one shows, by the way the board moves.
+
+    A camera alone knows how the board moves before it. Two cameras that look at one board see the same motion, turned
+    and shifted, if their frames are counted rightly. All shifts are compared at which the cameras share a third of the
+    most instants that they can share; between searched frames, the board is interpolated.
+
+    Args:
+        board: the board.
+        views: pixels of its corners, at instants whose numbers count frames.
+        lenses: model and vector of each camera's lens, as its own views have it.
+
+    Returns:
+        (cameras,), 0 also where the motion does not tell a shift.
+    """
+    count = len(views.names)
+    # Pictures that were taken now and then show no motion.
+    if count < 2 or len(views.number) < _LEAST_SHARED or np.median(np.diff(views.number)) > _MOST_STEP:
+        return np.zeros(count, np.int64)
+    seen = np.stack(
+        [_points_of_board(board, views, index, *lenses[name]) for index, name in enumerate(views.names)]
+    )
+    cost, shifts = np.zeros((count, count)), np.zeros((count, count), np.int64)
+    for first, second in combinations(range(count), 2):
+        left, shift = _motion_shift(views.number, seen[first], seen[second])
+        shifts[first, second], shifts[second, first] = shift, -shift
+        # A pair whose motion tells nothing is counted as it is, and joins only what nothing else joins.
+        cost[first, second] = 1 + left
+    order, before = breadth_first_order(minimum_spanning_tree(cost), 0, directed=False)
+    found = np.zeros(count, np.int64)
+    for camera in order[1:]:
+        found[camera] = found[before[camera]] + shifts[before[camera], camera]
+    return found
+
+
+def _points_of_board(
+    board: Board, views: BoardViews, camera: int, model: LensModel, lens: Float[np.ndarray, " unknowns"]
+) -> Float[np.ndarray, "instants 2 3"]:
+    """The board's middle and a point in front of it at each instant, camera, metres; NaN where it is not seen.
+
+    They are the same if the corners of a board that looks alike after a turn are in another order.
+    """
+    half_m = float(np.linalg.norm(np.ptp(board.corners_m, axis=0))) / 2
+    points_m = board.corners_m.mean(axis=0) - [[0.0, 0.0, 0.0], [0.0, 0.0, half_m]]
+    found = np.full((len(views.number), 2, 3), np.nan)
+    for instant in np.flatnonzero(views.seen[camera]):
+        for T in find_board_poses(board, model.normalise(lens, views.corners_px[camera, instant]))[:1]:
+            found[instant] = points_m @ T[:3, :3].T + T[:3, 3]
+    return found
+
+
+def _motion_shift(
+    number: Int[np.ndarray, " instants"],
+    first_m: Float[np.ndarray, "instants 2 3"],
+    second_m: Float[np.ndarray, "instants 2 3"],
+) -> tuple[float, int]:
+    """What one motion leaves of another at the shift that explains it best, as a fraction of the motion; the shift."""
+    step = int(np.median(np.diff(number)))
+    last = int(number[-1] - number[0])
+    tried: dict[int, tuple[float, int]] = {}
+
+    def best(shifts: Iterable[int]) -> int:
+        tried.update((shift, _left(first_m, _at(number, second_m, number + shift))) for shift in shifts)
+        least = max(_LEAST_SHARED, max(shared for _, shared in tried.values()) / 3)
+        return min(tried, key=lambda shift: (tried[shift][1] < least, tried[shift][0]))
+
+    # First where no frame is interpolated, then at single frames.
+    coarse = best(range(-(last // step) * step, last + 1, step))
+    shift = best(range(coarse - step, coarse + step + 1))
+    (left, shared), still = tried[shift], tried[0][0]
+    is_certain = shared >= _LEAST_SHARED and left < min(_EXPLAINED, _BETTER * still)
+    return (left, shift) if is_certain else (min(still, 1.0), 0)
+
+
+def _at(
+    number: Int[np.ndarray, " instants"],
+    points_m: Float[np.ndarray, "instants 2 3"],
+    wanted: Int[np.ndarray, " wanted"],
+) -> Float[np.ndarray, "wanted 2 3"]:
+    """Points at wanted numbers, linear between instants that follow each other; NaN where one of them is unknown."""
+    gap = np.diff(number)
+    row = (np.searchsorted(number, wanted, side="right") - 1).clip(0, max(len(number) - 2, 0))
+    part = ((wanted - number[row]) / gap[row])[:, None, None]
+    # Where nothing is interpolated the other instant does not count.
+    found = np.where(part == 0, points_m[row], (1 - part) * points_m[row] + part * points_m[row + 1])
+    found = np.where(part == 1, points_m[row + 1], found)
+    follow = (part == 0) | (part == 1) | (gap[row] <= 2 * np.median(gap))[:, None, None]
+    return np.where((part >= 0) & (part <= 1) & follow, found, np.nan)
+
+
+def _left(
+    a_m: Float[np.ndarray, "instants 2 3"], b_m: Float[np.ndarray, "instants 2 3"]
+) -> tuple[float, int]:
+    """Median distance between two motions, one of them turned and shifted, as a fraction of the motion's extent.
+
+    Also the number of instants at which both are known.
+    """
+    both = np.isfinite(a_m).all(axis=(1, 2)) & np.isfinite(b_m).all(axis=(1, 2))
+    shared = int(both.sum())
+    if shared < _LEAST_SHARED:
+        return np.inf, shared
+    a, b = a_m[both].reshape(-1, 3), b_m[both].reshape(-1, 3)
+    near = np.ones(len(a), bool)
+    for _ in range(_ROUNDS):
+        _, R, t_m = similarity(b[near], a[near], with_scale=False)
+        distance_m = np.linalg.norm(b @ R.T + t_m - a, axis=-1)
+        # The half that fits best, and what fits about as well, says where the next round looks.
+        near = distance_m <= 2 * np.median(distance_m)
+    extent_m = np.median(np.linalg.norm(a - np.median(a, axis=0), axis=-1))
+    return float(np.median(distance_m) / max(extent_m, 1e-300)), shared
 
 
 def _shift(
@@ -96,28 +211,24 @@ def _shift(
     key: Int[np.ndarray, " points"],
     points_px: Float[np.ndarray, "points 2"],
     points_m: Float[np.ndarray, "points 3"],
-    per_instant: int,
-    gate_px: float,
 ) -> list[Shift]:
     """The shift of a camera, if it has one; the camera is placed anew for each shift.
 
     Args:
         rig: the cameras.
         index: index of the camera.
-        key: numbers of points, `per_instant` of them for each instant.
+        key: numbers of points, two for each instant.
         points_px: the camera's pixels of the points; NaN where it does not see one.
         points_m: their positions by the other cameras; NaN where they do not know one.
-        per_instant: how many numbers an instant has.
-        gate_px: largest distance of a sighting from its point's projection, pixels.
     """
-    gate = gate_px / float(rig.cameras.K[index, 0, 0])
+    gate = _FITS_PX / float(rig.cameras.K[index, 0, 0])
     rays, known = undistort(rig.cameras[index], points_px), np.isfinite(points_m[:, 0])
     is_seen = np.isfinite(rays[:, 0])
     rays, known_m = rays[is_seen], points_m[known]
     fractions: dict[int, float] = {}
     least = _LEAST
     for shift in sorted(range(-_MOST_SHIFT, _MOST_SHIFT + 1), key=abs):
-        _, here, there = np.intersect1d(key[is_seen] + shift * per_instant, key[known], return_indices=True)
+        _, here, there = np.intersect1d(key[is_seen] + shift * 2, key[known], return_indices=True)
         if len(here) >= least:
             some = np.linspace(0, len(here) - 1, min(len(here), _MOST)).astype(np.int64)
             found = solve_pnp_ransac(known_m[there[some]], rays[here[some]], gate)
