@@ -6,7 +6,9 @@ loss finds the outliers. Least squares without the outliers gives the pose and i
 
     C = σ² (JᵀJ)⁻¹,
 
-with the stated σ, or with the residuals' σ if the residuals are larger than the stated σ explains.
+with the residuals' σ. Residuals that a slightly different lens explains (an F test) are not noise but the lens's error,
+which moves the camera by more than C says. C is then that of a camera whose lens is open, and contains the step from
+the one pose to the other.
 """
 
 from __future__ import annotations
@@ -16,16 +18,25 @@ from math import log
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+from scipy.stats import f as f_distribution
 
 from psotrack.calibration.bundle import Bundle, BundleState, KnownLens
+from psotrack.calibration.lens_models import known_lenses
 from psotrack.calibration.pnp import MIN_POINTS, Solver, solve_pnp, solve_pnp_ransac
-from psotrack.calibration.residuals import GATE, centre_by_pose, inflation, spread_px
+from psotrack.calibration.residuals import GATE, centre_by_pose, spread_px
 from psotrack.errors import InputError, check_positive
-from psotrack.geometry import Camera, undistort
+from psotrack.geometry import FISHEYE_COEFFICIENTS, Camera, make_rig, undistort
 from psotrack.geometry.estimation import covariance_from_information
 
 #: Largest median residual of a usable pose, in units of the stated σ; points within it may be inliers.
 _MAX_MEDIAN_SIGMAS = 10.0
+#: Standard deviations of a lens that is open: the focal lengths as a fraction, the optical axis in image widths, and
+#: the first two coefficients of the distortion. They are wide, and matter where the points leave the lens undetermined.
+_LENS_STD = np.array([0.1, 0.1, 0.05, 0.05, 0.3, 0.3])
+#: Residuals are not noise if an open lens explains as much by chance in fewer than this fraction of cases; smallest
+#: number of residuals that are left to tell.
+_BY_CHANCE, _LEAST_FREEDOM = 0.01, 4
 #: Points have no extent in a direction if the extent is below this fraction of the largest extent.
 _FLAT = 1e-3
 #: A pose is unique if it is this many times as likely as every other pose.
@@ -46,6 +57,9 @@ class Located:
         centre_covariance_m2: (3, 3), covariance of the camera's centre in the world, square metres.
         residual_px: (points,), distances of all points, outliers included, from their projections, pixels.
         used: (points,), False for outliers.
+        noise_px: standard deviation of a point along each axis, as the residuals show it, pixels.
+        lens_shift_m: how far away the camera is by a lens that explains the residuals far better, metres; 0 where
+            they are noise.
     """
 
     T_cam_world: Float[np.ndarray, "4 4"]
@@ -53,6 +67,8 @@ class Located:
     centre_covariance_m2: Float[np.ndarray, "3 3"]
     residual_px: Float[np.ndarray, " points"]
     used: Bool[np.ndarray, " points"]
+    noise_px: float
+    lens_shift_m: float
 
 
 def locate_camera(
@@ -70,7 +86,8 @@ def locate_camera(
             in a plane.
         points_px: (points, 2), positions in the image, pixels.
         lens: the camera's lens; the pose in it is ignored.
-        noise_px: standard deviation of `points_px` along each axis, pixels.
+        noise_px: a guess of the standard deviation of `points_px` along each axis, pixels, which counts as one point
+            beside the residuals.
         name: name of the camera in error messages.
 
     Raises:
@@ -99,14 +116,57 @@ def locate_camera(
         if (used == before).all():
             break
     try:
-        covariance = covariance_from_information(fit.equations().information, _MAX_INFLATION)
+        covariance = _covariance(fit)
     except np.linalg.LinAlgError:
         expected, found = "points that determine the camera's pose", "points that leave it undetermined"
         raise InputError(name, expected=expected, found=found) from None
-    covariance = covariance * inflation(fit.cost, 2 * int(fit.used.sum()) - 6)
-    T = fit.state.T_cam_world[0]
-    by_pose = centre_by_pose(T[:3, :3], T[:3, 3])
-    return Located(T, covariance, by_pose @ covariance @ by_pose.T, fit.distance_px[0], fit.used[0])
+    T, opened = fit.state.T_cam_world[0], _with_open_lens(fit, lens)
+    by_pose, shift_m = centre_by_pose(T[:3, :3], T[:3, 3]), 0.0
+    if opened is not None:
+        other = opened.state.T_cam_world[0]
+        turn = Rotation.from_matrix(other[:3, :3] @ T[:3, :3].T).as_rotvec()
+        step = np.concatenate([turn, other[:3, 3] - T[:3, 3]])
+        covariance = _covariance(opened) + np.outer(step, step)
+        shift_m = float(np.linalg.norm(by_pose @ step))
+    learned_px = noise_px * np.sqrt(_variance(fit))
+    centre_m2 = by_pose @ covariance @ by_pose.T
+    return Located(T, covariance, centre_m2, fit.distance_px[0], fit.used[0], learned_px, shift_m)
+
+
+def _squares(fit: Bundle) -> tuple[float, int]:
+    """Sum of squared residuals in units of the stated σ, and degrees of freedom."""
+    squares = (fit.distance_px[fit.used] / fit.problem.noise_px[0]) ** 2
+    return float(squares.sum()), 2 * len(squares) - fit.problem.size
+
+
+def _variance(fit: Bundle) -> float:
+    """Variance of the residuals in units of the stated one, which counts as one point's two residuals."""
+    total, freedom = _squares(fit)
+    return (2 + total) / (2 + freedom)
+
+
+def _covariance(fit: Bundle) -> Float[np.ndarray, "6 6"]:
+    """Covariance of the pose, whose unknowns come after those of the lens."""
+    covariance = covariance_from_information(fit.equations().information, _MAX_INFLATION)
+    return covariance[-6:, -6:] * _variance(fit)
+
+
+def _with_open_lens(fit: Bundle, lens: Camera) -> Bundle | None:
+    """The fit by a lens of another focal length, axis and distortion; None where this is no certain gain."""
+    total, freedom = _squares(fit)
+    if freedom - len(_LENS_STD) < _LEAST_FREEDOM or lens.K[0, 1]:
+        return None
+    padded = replace(lens, dist=np.pad(lens.dist, (0, max(0, FISHEYE_COEFFICIENTS - len(lens.dist)))))
+    ((model, vector),) = known_lenses(make_rig({"": padded})).values()
+    free = np.arange(len(vector)) < len(_LENS_STD)
+    scale = np.array([lens.K[0, 0], lens.K[1, 1], *np.full(2, lens.image_size_wh.max()), 1.0, 1.0])
+    information = np.zeros((len(vector), len(vector)))
+    information[free, free] = (_LENS_STD * scale) ** -2.0
+    problem = replace(fit.problem, models=(model,), priors=((vector, information),), free_lens=(free,))
+    opened = replace(fit, problem=problem, state=replace(fit.state, lenses=(vector,))).solved()
+    left, left_freedom = _squares(opened)
+    gain = (total - left) / len(_LENS_STD) / (left / left_freedom)
+    return opened if gain > f_distribution.ppf(1 - _BY_CHANCE, len(_LENS_STD), left_freedom) else None
 
 
 def _likely_poses(

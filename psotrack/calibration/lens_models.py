@@ -5,14 +5,25 @@ OpenCV projects: its pinhole model with 0 to 14 coefficients, and its fisheye mo
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import SettingsError
-from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, Camera, Rig, make_camera, undistort
+from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import (
+    FISHEYE_COEFFICIENTS,
+    PINHOLE_COEFFICIENTS,
+    Camera,
+    Rig,
+    make_camera,
+    make_rig,
+    undistort,
+)
+from psotrack.geometry.rig_files import rescale_lenses
 from psotrack.support import whole_number
 
 #: Number of unknowns of a lens before the distortion: fx, fy, cx, cy.
@@ -160,6 +171,30 @@ def known_lenses(rig: Rig) -> dict[str, tuple[LensModel, np.ndarray]]:
         values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], padded])
         known[name] = LensModel(size, is_fisheye), values
     return known
+
+
+def lenses_at_size(path: Path, lenses: Rig, sizes_wh: Mapping[str, tuple[int, int]]) -> Rig:
+    """Lenses of a file at the size of the images, where these show the same, enlarged or reduced.
+
+    Args:
+        path: the file.
+        lenses: its lenses by camera.
+        sizes_wh: width and height of the images by camera, pixels, where they are known.
+
+    Raises:
+        InputError: images have another shape than those of the calibration.
+    """
+    cameras = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
+    cameras = rescale_lenses(path, cameras, sizes_wh)
+    for name, size_wh in sizes_wh.items():
+        if name in cameras and (cameras[name].image_size_wh != size_wh).any():
+            width, height = cameras[name].image_size_wh
+            raise InputError(
+                f"camera {name}",
+                expected=f"images of {width:.0f} x {height:.0f} pixels as in {path}, or of the same shape",
+                found="{} x {}".format(*size_wh),
+            )
+    return make_rig(cameras)
 
 
 def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tuple[int, int]) -> Camera:

@@ -86,6 +86,8 @@ def init(
         calibration, unit=unit, match=match, leave_out=leave_out, fps=fps, size_wh=size_wh, bodies=bodies
     )
     draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
+    for each in draft.recording.cameras:
+        each.check_size()
     older = draft.write()
     content = draft.to_dict()
     output.json(content)
@@ -101,6 +103,8 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
     from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(sequence, bodies=bodies)
+    for each in recording.cameras:
+        each.check_size()
     recording.check_detections(recording.detections)
     if recording.marker_corners is not None:
         from psotrack.inside_out import read_marker_table

@@ -1,7 +1,8 @@
 """Camera names: which camera does a file's name, or a name that a user typed, belong to?
 
-Names are compared without regard to case, spaces, underscores, dashes, dots and zeros before a number: `GoPro 3` and
-`gopro3_clip` are of one camera. Numbers are compared as a whole: `cam1` is not `cam10`, and `cam1_0` is not `cam10`.
+Names are compared without regard to case, spaces, underscores, dashes, dots, brackets and zeros before a number:
+`GoPro 3`, `gopro3_clip` and `gopro[3]` are of one camera. Numbers are compared as a whole: `cam1` is not `cam10`, and
+`cam1_0` is not `cam10`.
 
 In the simulated half of the DPJAIT dataset the calibration says `cam1` and the files are `cam1i_s.avi`; sequences that
 psotrack simulated until version 0.1.0 say `cam1i` in the calibration. In the real half files and calibration bear the
@@ -124,7 +125,7 @@ def _words(name: str) -> str:
     """A name in lower case, with a dash for each separator, and without zeros before numbers."""
     # Some systems store an accented letter as a letter and an accent.
     folded = unicodedata.normalize("NFC", name).casefold()
-    parted = re.sub(r"[\s_.\-]+", "-", folded).strip("-")
+    parted = re.sub(r"[\s_.\-()\[\]]+", "-", folded).strip("-")
     return re.sub(r"\d+", lambda number: number[0].lstrip("0") or "0", parted)
 
 

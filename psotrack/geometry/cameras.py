@@ -171,6 +171,17 @@ def make_rig(named: dict[str, Camera]) -> Rig:
     return Rig(tuple(named), jax.tree.map(lambda *leaves: np.stack(leaves), *padded))
 
 
+def scale_lens(lens: Camera, image_size_wh: tuple[int, int]) -> Camera:
+    """The camera for its images enlarged or reduced to another size, pixels; or several cameras for images of one."""
+    factors = np.array(image_size_wh) / lens.image_size_wh
+    scale = np.zeros((*factors.shape[:-1], 3, 3))
+    scale[..., [0, 1], [0, 1]], scale[..., 2, 2] = factors, 1.0
+    # Pixel centres are at whole numbers, so that the edge at -1/2 stays where it is.
+    scale[..., :2, 2] = (factors - 1) / 2
+    sizes_wh = np.broadcast_to(np.array(image_size_wh, np.float64), factors.shape)
+    return replace(lens, K=scale @ lens.K, image_size_wh=sizes_wh)
+
+
 def look_at(
     centre_m: Sequence[float], target_m: Sequence[float], up: Sequence[float] = (0.0, 0.0, 1.0)
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float
 
 from psotrack.calibration import lens_of_view
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Camera, Rig, make_camera, make_rig
+from psotrack.geometry import Camera, Rig, make_camera, make_rig, scale_lens
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings.datasets import read_onboard_calibration
 from psotrack.support import read_table
@@ -112,15 +111,6 @@ def check_size(where: Path | str, lens: Camera, image_size_wh: Size) -> None:
             expected=f"{width} x {height} pixels as the lens is for",
             found="{} x {}".format(*image_size_wh),
         )
-
-
-def scale_lens(lens: Camera, image_size_wh: Size) -> Camera:
-    """The lens for its images enlarged or reduced to another size."""
-    factors = np.array(image_size_wh) / lens.image_size_wh
-    # Pixel centres are at whole numbers, so that the edge at -1/2 stays where it is.
-    shift = (factors - 1) / 2
-    K = np.array([[factors[0], 0.0, shift[0]], [0.0, factors[1], shift[1]], [0.0, 0.0, 1.0]]) @ lens.K
-    return replace(lens, K=K, image_size_wh=np.array(image_size_wh, np.float64))
 
 
 def _read_cameras(path: Path, image_size_wh: Size) -> Rig:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from math import gcd
 from pathlib import Path
 from typing import Any
 
@@ -112,10 +111,10 @@ class CameraRecording:
         found_w, found_h = self.video.image_size_wh
         if (width, height) == (found_w, found_h):
             return
-        remedy = "is it the video of another camera?"
-        if width * found_h == height * found_w:
-            factor = f"{found_w // gcd(found_w, width)}/{width // gcd(found_w, width)}"
-            remedy = f"if both show the same field of view, multiply the first two rows of K by {factor}"
+        remedy = (
+            "is it the video of another camera? If both show the same field of view, `psotrack calibrate convert` "
+            f"rescales the rig file with --size {found_w},{found_h}"
+        )
         raise InputError(
             self.video.path,
             expected=f"{width} x {height} pixels as calibrated",
@@ -172,7 +171,7 @@ class CameraRecording:
             "ignore": None if self.ignore is None else str(self.ignore),
         }
         if camera is not None:
-            content["image_size_wh"] = camera.image_size_wh.astype(int).tolist()
+            content["image_size_wh"] = content["image_size_wh"] or camera.image_size_wh.astype(int).tolist()
             content["focal_length_px"] = float(camera.K[0, 0])
             content["centre_m"] = [round(float(value), 4) for value in camera.centre_world]
         return content

@@ -185,15 +185,17 @@ def test_images_that_are_named_by_times_are_paired_with_the_nearest(tmp_path):
     """Nanoseconds, 33 ms apart, of cameras that are 1 ms apart; the second one lost a frame. TUM names seconds."""
     lost = -1
     for form in ("{:d}", "{:.6f}"):
-        for name, delay_ns in (("a", 0), ("b", 1_000_000)):
+        for name, delay_ns in (("cam[1]", 0), ("cam[2]", 1_000_000)):
             folder = tmp_path / form[2:-1] / name
             folder.mkdir(parents=True)
             for frame in range(6):
                 time_ns = 1_600_000_000_000_000_000 + 33_000_000 * frame + delay_ns
                 time = time_ns if form == "{:d}" else time_ns / 1e9
-                if (name, frame) != ("b", 3):
+                if (name, frame) != ("cam[2]", 3):
                     cv2.imwrite(str(folder / f"{form.format(time)}.png"), np.zeros((8, 8), np.uint8))
-        number, frames = instants_of_numbers(open_images(sorted(folder.parent.iterdir())))
+        cameras = open_images(sorted(folder.parent.iterdir()))
+        assert [camera.name for camera in cameras] == ["cam[1]", "cam[2]"]
+        number, frames = instants_of_numbers(cameras)
         np.testing.assert_array_equal(number, frames[:, 0])
         apart_ms = np.where(frames[:, 1] == lost, lost, frames[:, 1] - frames[:, 0]) / 1e6
         np.testing.assert_allclose(apart_ms, [1, 1, 1, 0, 1, 1], atol=0.01)

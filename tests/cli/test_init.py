@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
+from psotrack.geometry.rig_files import read_rig
 from psotrack.recordings import (
     CameraTable,
     RecordingFile,
@@ -108,6 +109,7 @@ def videos_of(folder):
         (("cam01", "cam02"), ("cam1.avi", "cam_2_take7.avi")),
         (("front left", "front"), ("front_left.avi", "front.avi")),
         (("top", "side"), ("top/minimal_top.avi", "side/clip.avi")),
+        (("cam1", "cam2"), ("cam[1]/clip.avi", "cam(2).avi")),
     ],
 )
 def test_files_are_matched_to_cameras(init, folder, cameras, videos):
@@ -196,6 +198,32 @@ def test_a_calibration_that_leaves_its_unit_open(init, refuses, folder):
     init(path, "--units", "mm")
     assert 'calibration_unit = "mm"' in (path / "recording.toml").read_text()
     np.testing.assert_allclose(open_recording(path).rig.cameras.T_cam_world[0, :3, 3], [0, 0, 5], atol=1e-12)
+
+
+def test_videos_that_are_smaller_than_calibrated(init, refuses, folder, run_psotrack, caplog):
+    """Of the same shape, the lens is rescaled about the image's corner, half a pixel outside the first pixel."""
+    path = folder("left.avi", cameras=("left",))
+    K = {"32": "63.5", "60": "120", "24": "47.5"}
+    large = (path / "rig.toml").read_text().replace("[64, 48]", "[128, 96]")
+    for small, twice in K.items():
+        large = large.replace(f"{small},", f"{twice},").replace(f"{small}]", f"{twice}]")
+    (path / "rig.toml").write_text(large)
+    shown = init(path)
+    words = "rescaled from 128 x 96 to 64 x 48 pixels, the size of the images, for camera left; this is right where"
+    assert words in caplog.text
+    assert "64 x 48" in shown
+    half = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
+    np.testing.assert_allclose(open_recording(path).usable().rig.cameras.K, [half])
+    done = run_psotrack("calibrate", "convert", path / "rig.toml", path / "small.toml", "--size", "64,48")
+    assert "rescaled from 128 x 96 to 64 x 48 pixels: both must show the same field of view" in done.out
+    np.testing.assert_allclose(read_rig(path / "small.toml").cameras.K, [half])
+    wrong = ("calibrate", "convert", path / "rig.toml", path / "no.toml", "--size", "64,40")
+    words = "--size: expected a size of the shape of 128 x 96 pixels, as rig.toml"
+    assert_refused(lambda: run_psotrack(*wrong), words, unchanged=path)
+    (path / "rig.toml").write_text(large.replace("[128, 96]", "[128, 80]"))
+    refuses(
+        path, "left.avi: expected 128 x 80 pixels as calibrated, found 64 x 48 pixels", options=("--force",)
+    )
 
 
 def test_a_file_edited_by_hand_is_kept_beside_the_new_one(init, folder):

@@ -27,7 +27,7 @@ from marker_worlds import (
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
-from psotrack.geometry import project
+from psotrack.geometry import project, scale_lens
 from psotrack.inside_out import (
     Flag,
     LocaliseSettings,
@@ -39,7 +39,6 @@ from psotrack.inside_out import (
     write_camera_path,
 )
 from psotrack.inside_out.frames import read_ahead
-from psotrack.inside_out.lens_files import scale_lens
 from psotrack.inside_out.localising import frame_poses, localise_frames
 from psotrack.recordings.datasets import write_marker_corners
 from psotrack.trajectories import Status, read_trajectories, roll_pitch_yaw_deg

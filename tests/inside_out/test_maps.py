@@ -32,7 +32,7 @@ from marker_worlds import (
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.geometry import make_rig
+from psotrack.geometry import make_rig, scale_lens
 from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import (
     LocaliseSettings,
@@ -45,7 +45,6 @@ from psotrack.inside_out import (
     read_marker_map,
     read_measured_corners,
 )
-from psotrack.inside_out.lens_files import scale_lens
 from psotrack.inside_out.localising import localise_frames
 from psotrack.inside_out.mapping import complete_map
 from psotrack.inside_out.mapping.sightings import collect_sightings, outward

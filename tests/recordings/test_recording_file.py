@@ -476,7 +476,7 @@ def with_times(times):
 
 def another_size(folder):
     toml('calibration = "rig.toml"\n[cameras.c0]\nvideo = "left.avi"\n')(folder)
-    write_rig(folder / ANY / "rig.toml", ring_rig(1, image_size_wh=(128, 96)))
+    write_rig(folder / ANY / "rig.toml", ring_rig(1, image_size_wh=(128, 80)))
 
 
 def other_names(folder):
@@ -506,7 +506,7 @@ NO_RECORDINGS = {
                              "found only c0, c1; `psotrack init --force --match CAMERA=FILE` maps them"),
     "a stream": (toml(f"{LEFT.replace('left.avi', 'rtsp://left/1')}size = [64, 48]\n"), usable,
                  "camera left: expected a video file, found the stream rtsp://left/1"),
-    "another size than calibrated": (another_size, usable, "128 x 96 pixels as calibrated, found 64 x 48 ", "by 1/2"),
+    "another shape": (another_size, usable, "128 x 80 pixels as calibrated, found 64 x 48 pixels", "--size 64,48"),
 }  # fmt: skip
 
 # --- detections, videos and pictures
@@ -593,14 +593,14 @@ FRAME_TIMES = {
     ),
 }  # fmt: skip
 SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
-SCALED = "if both show the same field of view, multiply the first two rows of K by "
+ANOTHER = "is it the video of another camera? If both show the same field of view, `psotrack calibrate convert` resc"
 #: Name of the case -> recording, arguments of `usable`, words of the line.
 USABLE = {
     "no video is named": (full_hd_recording(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
     "smaller": (full_hd_recording(a={"image_size_wh": (1280, 720)}), {},
-                SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
+                SIZE.format("a", "1280 x 720", ANOTHER)),
     "another shape": (full_hd_recording(c={"image_size_wh": (1920, 1200)}), {},
-                      SIZE.format("c", "1920 x 1200", "is it the video of another camera?")),
+                      SIZE.format("c", "1920 x 1200", ANOTHER)),
 }  # fmt: skip
 
 # --- tracks in the formats of other programs

@@ -12,7 +12,7 @@ import numpy as np
 
 from psotrack.calibration.board_recognition import describe_board, detect_board
 from psotrack.calibration.boards import Board
-from psotrack.calibration.lens_models import known_lenses, parse_lens_model
+from psotrack.calibration.lens_models import known_lenses, lenses_at_size, parse_lens_model
 from psotrack.calibration.rig.adjustment import (
     CalibratedRig,
     LensChoice,
@@ -70,13 +70,13 @@ def calibrate_by_board(
         InputError: an image cannot be read, the board is not seen, or the views do not determine the rig.
         SettingsError: the settings do not say what the board is like, or do not fit the sources.
     """
-    given, lenses = None if settings.world is None else read_world(settings.world), _lens_choice(settings)
+    given = None if settings.world is None else read_world(settings.world)
     if len(sources) == 1 and is_recording(sources[0]):
         cameras, instants = open_recorded(open_recording(sources[0]))
     else:
         cameras = open_images(sources, settings.names)
         instants = instants_of_numbers(cameras)
-    said = []
+    lenses, said = _lens_choice(settings, cameras), []
     if settings.squares is None:
         stated = detect_board(settings.square_m or 0.0, first_images(cameras, 4))
         said.append(f"the board is {describe_board(stated)}")
@@ -179,6 +179,11 @@ def _result(
     )
 
 
-def _lens_choice(settings: RigSettings) -> LensChoice:
-    known = None if settings.lenses is None else known_lenses(read_lenses(settings.lenses))
-    return LensChoice(parse_lens_model(settings.lens), known)
+def _lens_choice(settings: RigSettings, cameras: Sequence[CameraImages]) -> LensChoice:
+    model = parse_lens_model(settings.lens)
+    if settings.lenses is None:
+        return LensChoice(model)
+    sizes_wh = {camera.name: camera.image_size_wh for camera in cameras}
+    return LensChoice(
+        model, known_lenses(lenses_at_size(settings.lenses, read_lenses(settings.lenses), sizes_wh))
+    )

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.image_points import find_markers, read_image_points
-from psotrack.calibration.lens_models import lens_of_view
+from psotrack.calibration.lens_models import lens_of_view, lenses_at_size
 from psotrack.calibration.rig.findings import RigCalibration
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
@@ -137,11 +137,13 @@ def calibrate_by_known_points(
     if settings.world is not None:
         expected = "none with points of known place, which are the world"
         raise SettingsError("--world", expected=expected, found=f"{settings.world}")
+    sizes_wh: dict[str, tuple[int, int]] = {}
     if marker_corners_m is not None:
         if len(sources) == 1 and is_recording(sources[0]):
             videos = open_recording(sources[0]).videos
         else:
             videos = {camera.name: camera.video for camera in open_images(sources, settings.names)}
+        sizes_wh = {name: video.image_size_wh for name, video in videos.items()}
         marks = {
             name: find_markers(video, marker_corners_m, settings.dictionary) for name, video in videos.items()
         }
@@ -149,8 +151,8 @@ def calibrate_by_known_points(
         raise SettingsError("--pairs", expected="no video", found=f"{sources[0]}")
     else:
         marks = read_image_points(settings.pairs or "", settings.places)
-    lenses, world = _lenses_of(tuple(marks), settings), settings.pairs or settings.markers
-    cameras, fits = {}, {}
+    lenses, world = _lenses_of(tuple(marks), settings, sizes_wh), settings.pairs or settings.markers
+    cameras, fits, notes = {}, {}, [f"the world is that of {world}"]
     for index, (name, mark) in enumerate(marks.items()):
         lens = lenses.cameras[index]
         with errors_name(world):
@@ -160,7 +162,12 @@ def calibrate_by_known_points(
         cameras[name] = replace(lens, T_cam_world=located.T_cam_world)
         covariance_m2 = located.centre_covariance_m2
         fits[name] = PointFit(mark.points, covariance_m2, located.residual_px, located.used)
-    return _calibration(make_rig(cameras), fits, [f"the world is that of {world}"])
+        if located.lens_shift_m:
+            notes.append(
+                f"the residuals of {name} are not noise: another lens explains them, and has the camera "
+                f"{1e3 * located.lens_shift_m:.0f} mm away, which its standard deviation contains; calibrate its lens"
+            )
+    return _calibration(make_rig(cameras), fits, notes)
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
@@ -203,8 +210,13 @@ def _weak(found: PointRig, rig: Rig, covariance_m2: Float[np.ndarray, "cameras 3
     return sentences
 
 
-def _lenses_of(names: Sequence[str], settings: RigSettings) -> Rig:
-    """Lenses of the cameras, from a calibration or a data sheet; a file with one camera has the lens of all."""
+def _lenses_of(
+    names: Sequence[str], settings: RigSettings, sizes_wh: Mapping[str, tuple[int, int]] | None = None
+) -> Rig:
+    """Lenses of the cameras, from a calibration or a data sheet; a file with one camera has the lens of all.
+
+    `sizes_wh` has the sizes of the images where they are known, pixels.
+    """
     path, fov_deg = settings.lenses, settings.fov_deg
     if (path is None) == (fov_deg is None):
         raise SettingsError(
@@ -218,16 +230,17 @@ def _lenses_of(names: Sequence[str], settings: RigSettings) -> Rig:
         raise SettingsError("--size", expected="width and height of the images", found="none")
     else:
         lenses = make_rig({"all": lens_of_view(*(fov_deg or (0.0, 0.0)), settings.size)})
-    if len(lenses) == 1:
-        return Rig(tuple(names), lenses.cameras[np.zeros(len(names), np.int64)])
-    chosen = [chosen_camera(name, lenses.names) for name in names]
+    one = lenses.names[0] if len(lenses) == 1 else None
+    chosen = [one or chosen_camera(name, lenses.names) for name in names]
     for name, found in zip(names, chosen, strict=True):
         if found is None:
             raise InputError(
                 path or "lenses", expected=f"the lens of {name}", found=f"only {', '.join(lenses.names)}"
             )
     rows = np.array([lenses.names.index(found) for found in chosen if found is not None])
-    return Rig(tuple(names), lenses.cameras[rows])
+    if settings.size is not None and not sizes_wh:
+        sizes_wh = dict.fromkeys(names, settings.size)
+    return lenses_at_size(path or Path("--size"), Rig(tuple(names), lenses.cameras[rows]), sizes_wh or {})
 
 
 def _read_views(sources: Sequence[Path]) -> PointViews:

@@ -178,25 +178,30 @@ def choose_instants(instants: Instants, floor: int | None = None, shifts: Sequen
 def _names(paths: list[Path]) -> list[str]:
     """Names of the cameras: the first part, from the end of the paths, in which all paths differ."""
     if len(paths) == 1:
-        return [_stem(paths[0].name)]
+        return [_stem(paths[0].name, paths[0])]
     parts = [path.absolute().parts for path in paths]
     for depth in range(1, min(map(len, parts)) + 1):
-        words = [_stem(part[-depth]) for part in parts]
+        words = [_stem(part[-depth], path) for part, path in zip(parts, paths, strict=True)]
         if len(set(words)) == len(words):
             return words
         if len(set(words)) > 1:
             break
-    return [_stem(path.name) for path in paths]
+    return [_stem(path.name, path) for path in paths]
 
 
-def _stem(word: str) -> str:
-    """A file's name without its suffix, and without the wildcards of a pattern."""
+def _is_pattern(path: Path) -> bool:
+    """Whether a path stands for several files; a folder may be called cam[1]."""
+    return bool(_PATTERN.search(path.name)) and not path.exists()
+
+
+def _stem(word: str, path: Path) -> str:
+    """A part of a path without its suffix, and without the wildcards of a pattern."""
     stem = word if not Path(word).suffix else Path(word).stem
-    return _PATTERN.split(stem)[0].rstrip("_-. ") or stem
+    return (_PATTERN.split(stem)[0].rstrip("_-. ") or stem) if _is_pattern(path) else stem
 
 
 def _open(name: str, path: Path) -> CameraImages:
-    if _PATTERN.search(path.name):
+    if _is_pattern(path):
         files = sorted(file for file in path.parent.glob(path.name) if file.suffix.lower() in IMAGE_SUFFIXES)
         if not files:
             raise InputError(path, expected="images of this pattern", found="none")

@@ -70,7 +70,8 @@ class PointSettings:
             the lenses.
         places: positions of the points of --pairs, if it has none: point,x_m,y_m,z_m.
         markers: ArUco markers of known place instead of a board: a map of their corners. Needs the lenses.
-        noise_px: standard deviation of a point in the image, along x and along y, in pixels, with --pairs or --markers.
+        noise_px: a guess of the standard deviation of a point in the image, along x and along y, in pixels, with
+            --pairs or --markers; it is learned from the residuals, beside which the guess counts as one point.
     """
 
     points: bool = False

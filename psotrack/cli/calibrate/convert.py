@@ -44,9 +44,11 @@ def convert(
       psotrack calibrate convert calibration.toml rig.toml --units mm
       psotrack calibrate convert cameras_calibration.csv rig.yml --size 1920,1080
       psotrack calibrate convert dltcoefs.csv rig.toml --units m --size 1920,1080 --distortion lenses.txt
+      psotrack calibrate convert rig.toml half.toml --size 960,540
 
     Options:
-        size: size of the images in pixels, if the calibration file does not contain the size.
+        size: size of the images in pixels. If IN states another one of the same shape, the lenses are rescaled, which
+            is right where the images of both sizes show the same field of view.
         units: unit of the lengths in IN; needed if the format leaves the unit open.
         format: format of IN. None: found by the content.
         to: format of OUT. None: by the name of OUT.
@@ -55,7 +57,9 @@ def convert(
         distortion: calibration of any format whose distortion the cameras get, by name: for DLT coefficients of points
             that were undistorted with it.
     """
-    from psotrack.geometry import Rig
+    import numpy as np
+
+    from psotrack.geometry import Rig, scale_lens
     from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_rig
 
     if units is not None and units not in UNITS_M:
@@ -74,6 +78,17 @@ def convert(
             own = read_lenses(distortion, size).select(rig.names).cameras
         # The focal length stays: it is that with which the coefficients were found.
         rig = Rig(rig.names, replace(rig.cameras, dist=own.dist, fisheye=own.fisheye))
+    calibrated_wh = np.unique(rig.cameras.image_size_wh, axis=0)
+    if size is not None and (calibrated_wh != size).any():
+        shapes = " and ".join(f"{width:.0f} x {height:.0f}" for width, height in calibrated_wh)
+        # A side is a whole number of pixels.
+        if (np.abs(calibrated_wh[:, 1] * size[0] / calibrated_wh[:, 0] - size[1]) >= 1).any():
+            expected = f"a size of the shape of {shapes} pixels, as {source.name} states"
+            raise SettingsError("--size", expected=expected, found="{},{}".format(*size))
+        rig = Rig(rig.names, scale_lens(rig.cameras, size))
+        output.say(
+            f"rescaled from {shapes} to {size[0]} x {size[1]} pixels: both must show the same field of view"
+        )
     if undistorted:
         rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
     write_rig(out, rig, force=output.force, file_format=to, placed=not lenses)

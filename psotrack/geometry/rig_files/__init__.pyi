@@ -7,6 +7,7 @@ from .formats import (
     read_cameras,
     read_lenses,
     read_rig,
+    rescale_lenses,
     write_rig,
 )
 from .rig_toml import KEYS, fields_of_table
@@ -24,6 +25,7 @@ __all__ = [
     "read_cameras",
     "read_lenses",
     "read_rig",
+    "rescale_lenses",
     "write_calibration",
     "write_rig",
 ]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Rig, make_rig
+from psotrack.geometry import Camera, Rig, make_rig, scale_lens
 from psotrack.geometry.rig_files import (
     camera_tables,
     dpjait_calibration,
@@ -195,6 +195,30 @@ def entries_of(
             placed.path, placed.unit_m, metres_per_unit,
         )  # fmt: skip
     return found
+
+
+def rescale_lenses(
+    path: Path, cameras: Mapping[str, Camera], sizes_wh: Mapping[str, tuple[int, int] | None]
+) -> dict[str, Camera]:
+    """Cameras of a rig file at the size of their images, where these have the same shape; a warning names them.
+
+    Args:
+        path: the rig file, for the warning.
+        cameras: the cameras by name.
+        sizes_wh: width and height of the images, pixels; nothing, or None, where they are not known.
+    """
+    scaled, to = {}, {}
+    for name, camera in cameras.items():
+        (width, height), size_wh = camera.image_size_wh.astype(int).tolist(), sizes_wh.get(name)
+        if size_wh and (width, height) != size_wh and width * size_wh[1] == height * size_wh[0]:
+            scaled[name] = scale_lens(camera, size_wh)
+            to[f"{width} x {height} to {size_wh[0]} x {size_wh[1]}"] = None
+    if scaled:
+        _logger.warning(
+            "%s: rescaled from %s pixels, the size of the images, for camera %s; this is right where images of both "
+            "sizes show the same field of view", path, " and ".join(to), ", ".join(scaled),
+        )  # fmt: skip
+    return {**cameras, **scaled}
 
 
 def write_rig(

@@ -381,7 +381,7 @@ def _table(matching: Matching, name: str, base: Path, options: DraftOptions) -> 
             expected = f"frames per second of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
     if not isinstance(video, Path):
-        size = matching.known.get(name) or options.size_wh
+        size = options.size_wh or matching.known.get(name)
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")

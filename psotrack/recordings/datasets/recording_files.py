@@ -21,6 +21,7 @@ from psotrack.geometry.rig_files import (
     entries_of,
     fields_of_table,
     read_cameras,
+    rescale_lenses,
 )
 from psotrack.recordings import (
     MOST_INSTANTS,
@@ -321,7 +322,16 @@ def _calibrated(
         {own: size_wh for own, size_wh in sizes.items() if size_wh},
         metres_per_unit=UNITS_M[content.calibration_unit] if content.calibration_unit else None,
     )
-    return {name: entries[own] for name, own in known.items() if own in entries}
+    rescaled = rescale_lenses(
+        path.parent / content.calibration,
+        {name: each for name, own in known.items() if own in entries and (each := entries[own].camera)},
+        sizes_wh,
+    )
+    return {
+        name: replace(entries[own], camera=rescaled.get(name))
+        for name, own in known.items()
+        if own in entries
+    }
 
 
 def _check_names(
@@ -364,6 +374,10 @@ def _camera(
         known = camera_values(calibrated.camera, placed=calibrated.placed)
     # A size of the rig file that differs from the video's is an error of `Recording.usable`.
     size_wh = known.get("size") or own_wh
+    if opened.video is None and own_wh not in (None, size_wh and tuple(size_wh)):
+        raise named.error(
+            "size", f"{_size_text(size_wh)} as calibrated, or of this shape", _size_text(own_wh)
+        )
     if size_wh is None and opened.stream is None:
         expected = "width and height of the images, because the camera has no video"
         raise named.error("size", expected, "none")
