@@ -30,6 +30,7 @@ from psotrack.calibration import (
     Board,
     BoardViews,
     calibrate_rig,
+    choose_instants,
     find_views,
     instants_of_numbers,
     open_images,
@@ -88,7 +89,7 @@ def main() -> None:
     for name in ["stereo chessboard"] if options.quick else options.sets:
         paths, board, published = SETS[name]
         cameras = open_images([options.real / path for path in paths])
-        found = find_views(board, cameras, instants_of_numbers(cameras))
+        found = find_views(board, cameras, choose_instants(instants_of_numbers(cameras)))
         board, views = found.board, found.views
         if name == "charuco_calibration":
             views = one_frame_later(views, "cam_1")

@@ -187,11 +187,11 @@ def lenses_at_size(path: Path, lenses: Rig, sizes_wh: Mapping[str, tuple[int, in
     cameras = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
     cameras = rescale_lenses(path, cameras, sizes_wh)
     for name, size_wh in sizes_wh.items():
-        if name in cameras and (cameras[name].image_size_wh != size_wh).any():
-            width, height = cameras[name].image_size_wh
+        width, height = cameras[name].image_size_wh.astype(int).tolist() if name in cameras else size_wh
+        if (width, height) != size_wh:
             raise InputError(
                 f"camera {name}",
-                expected=f"images of {width:.0f} x {height:.0f} pixels as in {path}, or of the same shape",
+                expected=f"images of {width} x {height} pixels as in {path}, or of the same shape",
                 found="{} x {}".format(*size_wh),
             )
     return make_rig(cameras)

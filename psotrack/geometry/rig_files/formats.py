@@ -207,16 +207,17 @@ def rescale_lenses(
         cameras: the cameras by name.
         sizes_wh: width and height of the images, pixels; nothing, or None, where they are not known.
     """
-    scaled, to = {}, {}
+    scaled: dict[str, Camera] = {}
+    sizes: list[str] = []
     for name, camera in cameras.items():
         (width, height), size_wh = camera.image_size_wh.astype(int).tolist(), sizes_wh.get(name)
         if size_wh and (width, height) != size_wh and width * size_wh[1] == height * size_wh[0]:
             scaled[name] = scale_lens(camera, size_wh)
-            to[f"{width} x {height} to {size_wh[0]} x {size_wh[1]}"] = None
+            sizes.append(f"{width} x {height} to {size_wh[0]} x {size_wh[1]}")
     if scaled:
         _logger.warning(
             "%s: rescaled from %s pixels, the size of the images, for camera %s; this is right where images of both "
-            "sizes show the same field of view", path, " and ".join(to), ", ".join(scaled),
+            "sizes show the same field of view", path, " and ".join(dict.fromkeys(sizes)), ", ".join(scaled),
         )  # fmt: skip
     return {**cameras, **scaled}
 
