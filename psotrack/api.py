@@ -197,7 +197,7 @@ def _refuse_misfit(found: calibration.RigCalibration, source: Path) -> None:
     raise InputError(
         source,
         expected="a rig that fits the board's views to 0.5 % of the images' width",
-        found=f"medians of {found.misfit}",
+        found=f"the board off by {found.misfit}, in the median",
         remedy="; ".join(
             [
                 "check that the videos overlap in time, that no camera was moved, and the board's sizes",

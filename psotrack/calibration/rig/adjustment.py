@@ -417,18 +417,22 @@ def _covariance(bundle: Bundle) -> Float[np.ndarray, "unknowns unknowns"]:
     reduced = equations.reduced()
     # An unknown that no view determines may have an information a little below 0, by rounding.
     scale = np.sqrt(np.maximum(np.diag(reduced.information), 0.0))
+    undetermined = InputError(
+        "board",
+        expected="views that determine lenses and places of all cameras",
+        found="views that leave some open",
+        remedy="tilt the board, and move it through the whole image of each camera; if it was, check that the videos "
+        "show it at the same time, and the board's stated numbers and sizes with a ruler",
+    )
     if not (scale > 0).all() or np.linalg.cond(reduced.information / np.outer(scale, scale)) > _MAX_CONDITION:
-        raise InputError(
-            "board",
-            expected="views that determine lenses and places of all cameras",
-            found="views that leave some open",
-            remedy="tilt the board, and move it through the whole image of each camera; if it was, check the board's "
-            "stated numbers and sizes with a ruler",
-        )
+        raise undetermined
     inverse = np.linalg.inv(reduced.information / np.outer(scale, scale)) / np.outer(scale, scale)
     information, pull = _by_instant(bundle, reduced.gain)
     # In units in which the information of all instants is 1, an instant's share of it is a matrix between 0 and 1.
-    half = np.linalg.cholesky((inverse + inverse.T) / 2)
+    try:
+        half = np.linalg.cholesky((inverse + inverse.T) / 2)
+    except np.linalg.LinAlgError:
+        raise undetermined from None
     shares, axes = np.linalg.eigh(half.T @ information @ half)
     left = np.maximum(1 - shares, _LEAST_LEFT)
     pulled = np.matvec(axes, np.matvec(axes.swapaxes(-1, -2), pull @ half) / left)

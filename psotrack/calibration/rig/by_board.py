@@ -175,7 +175,7 @@ def _result(
         after,
         more,
         calibrated,
-        misfit=say_misfit(figures),
+        misfit=say_misfit(calibrated),
     )
 
 

@@ -29,8 +29,8 @@ _SHARED = 12
 _FOCAL_STD = 0.005
 #: A camera's views slip if the residuals are larger by this factor, and by this many pixels, than within the views.
 _SLIP_FACTOR, _SLIP_PX = 2.0, 0.3
-#: Largest median residual of a camera that fits, as a fraction of the image's longer side: ten pixels of 1920. Cameras
-#: whose frames are half an interval apart are within half of it, if the board is moved by hand.
+#: Largest distance of a board from where a camera sees it, median of the instants, as a fraction of the image's longer
+#: side: ten pixels of 1920. A board that is moved by hand is within it for frames that are half an interval apart.
 _MISFIT = 0.005
 #: Largest number of pictures in a row.
 _PICTURES = 4
@@ -173,13 +173,22 @@ def say_starts(names: Sequence[str], shifts: Sequence[int]) -> list[str]:
     ]
 
 
-def say_misfit(figures: Mapping[str, Mapping[str, Any]]) -> str:
-    """Cameras whose views the rig does not fit, and by how much; empty where it fits all of them."""
-    return ", ".join(
-        f"{row['median_px']:.1f} px in {name}"
-        for name, row in figures.items()
-        if row["median_px"] > _MISFIT * max(row["image_size_wh"])
-    )
+def say_misfit(calibrated: CalibratedRig) -> str:
+    """Cameras that do not have the board where others have it, and by how much; empty where all agree.
+
+    A board's place follows the cameras that agree on it, so that of two that do not each fits half of the instants.
+    What counts is the camera that fits worst at each instant.
+    """
+    residual_px, names = calibrated.residual_px, calibrated.rig.names
+    seen = np.isfinite(residual_px).any(axis=-1)
+    off_px = np.zeros(seen.shape)
+    off_px[seen] = np.nanmedian(residual_px[seen], axis=-1)
+    widths_px = calibrated.views.image_size_wh.max(axis=1)
+    worst = (off_px / widths_px[:, None]).max(axis=0)
+    shared = seen & (seen.sum(axis=0) >= min(2, len(seen)))
+    typical = [float(np.median(worst[of_camera])) if of_camera.any() else 0.0 for of_camera in shared]
+    found = zip(names, typical, widths_px.tolist(), strict=True)
+    return ", ".join(f"{part * width:.1f} px with {name}" for name, part, width in found if part > _MISFIT)
 
 
 def say_print(found: FoundBoards) -> list[str]:
