@@ -177,8 +177,8 @@ def calibrate_rig(
         found = calibration.calibrate_by_moving_point(paths, settings)
     elif settings.by_board:
         found = calibration.calibrate_by_board(paths, settings, report_of(progress))
-        if found.misfit and out is not None and not force:
-            _refuse_misfit(found, paths[0])
+        if found.misfit is not None and out is not None and not force:
+            raise found.misfit
         if plot is not None and found.calibrated is not None:
             calibration.save_coverage(Path(plot), found.calibrated, force=force)
     else:
@@ -190,22 +190,6 @@ def calibrate_rig(
         write_rig(out, found.rig, force=force)
         found = replace(found, path=Path(out))
     return found
-
-
-def _refuse_misfit(found: calibration.RigCalibration, source: Path) -> None:
-    """Raise `InputError` about a rig that does not fit the views of its board."""
-    raise InputError(
-        source,
-        expected="a rig that fits the board's views to 0.5 % of the images' width",
-        found=f"the board off by {found.misfit}, in the median",
-        remedy="; ".join(
-            [
-                "check that the videos overlap in time, that no camera was moved, and the board's sizes",
-                *found.more["advice"],
-                "--force writes the rig nevertheless",
-            ]
-        ),
-    )
 
 
 def doctor(

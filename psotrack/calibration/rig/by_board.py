@@ -24,7 +24,7 @@ from psotrack.calibration.rig.findings import (
     RigCalibration,
     advise,
     figures_of,
-    say_misfit,
+    find_misfit,
     say_print,
     say_searched,
     say_starts,
@@ -175,7 +175,7 @@ def _result(
         after,
         more,
         calibrated,
-        misfit=say_misfit(calibrated),
+        misfit=find_misfit(calibrated, advice),
     )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from psotrack.calibration.rig.adjustment import CalibratedRig
 from psotrack.calibration.rig.views import FoundBoards
+from psotrack.errors import InputError
 from psotrack.geometry import Rig
 from psotrack.support import html_block, html_table, save_figure, text_table
 
@@ -52,7 +53,7 @@ class RigCalibration:
         after: sentences below the table.
         more: what JSON has besides the cameras.
         calibrated: how the rig fits each view of a board; None without a board.
-        misfit: what does not fit the rig, which is then not written without `force`; empty where it fits.
+        misfit: error about views that do not fit the rig, which is then not written without `force`; None where all do.
         path: file of the rig; None where it is not written.
     """
 
@@ -63,7 +64,7 @@ class RigCalibration:
     after: Sequence[str] = ()
     more: Mapping[str, Any] = field(default_factory=dict)
     calibrated: CalibratedRig | None = None
-    misfit: str = ""
+    misfit: InputError | None = None
     path: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -173,8 +174,8 @@ def say_starts(names: Sequence[str], shifts: Sequence[int]) -> list[str]:
     ]
 
 
-def say_misfit(calibrated: CalibratedRig) -> str:
-    """Cameras that do not have the board where others have it, and by how much; empty where all agree.
+def find_misfit(calibrated: CalibratedRig, advice: Sequence[str]) -> InputError | None:
+    """Error about cameras that do not have the board where others have it; None where all agree.
 
     A board's place follows the cameras that agree on it, so that of two that do not each fits half of the instants.
     What counts is the camera that fits worst at each instant.
@@ -187,8 +188,16 @@ def say_misfit(calibrated: CalibratedRig) -> str:
     worst = (off_px / widths_px[:, None]).max(axis=0)
     shared = seen & (seen.sum(axis=0) >= min(2, len(seen)))
     typical = [float(np.median(worst[of_camera])) if of_camera.any() else 0.0 for of_camera in shared]
-    found = zip(names, typical, widths_px.tolist(), strict=True)
-    return ", ".join(f"{part * width:.1f} px with {name}" for name, part, width in found if part > _MISFIT)
+    off = [
+        f"{part * width:.1f} px with {name}"
+        for name, part, width in zip(names, typical, widths_px.tolist(), strict=True)
+        if part > _MISFIT
+    ]
+    causes = "check that the videos overlap in time, that no camera was moved, and the board's sizes"
+    remedy = "; ".join([causes, *advice, "--force writes the rig nevertheless"])
+    expected = f"a rig that fits the board's views to {_MISFIT:.1%} of the images' width"
+    found = f"the board off by {', '.join(off)}, in the median"
+    return InputError("board", expected=expected, found=found, remedy=remedy) if off else None
 
 
 def say_print(found: FoundBoards) -> list[str]:
