@@ -26,7 +26,7 @@ from psotrack.foreground.silhouettes import (
     reduce_frame,
 )
 from psotrack.live.cameras import LiveCamera
-from psotrack.live.meeting import Instant, Meeting
+from psotrack.live.meeting import STOPPED_S, Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import ANSWER_S, SourceFrame
 
@@ -38,6 +38,8 @@ _MOST_WAITING = 3
 _LONGEST_TURN_S = 0.02
 #: Longest time for which the session waits for frames before it looks what is to be done without them, seconds.
 _LOOK_S = 0.005
+#: What is said of a camera whose images have not shown its scene for as long as one that has stopped.
+_UNSEEN = "its images do not show the scene: too dark, too bright, of one colour, or another picture"
 #: Time from the start of the sources to the recording's time 0, seconds.
 _LEAD_S = 0.2
 #: Longest time that the threads have to end, seconds: OpenCV waits 10 s for a device that does not answer.
@@ -66,6 +68,7 @@ class FrontEnd:
         # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
         self._is_stopped = False
         self._said = [""] * len(cameras)
+        self._shown_s = [np.inf] * len(cameras)
         self.num_left_out = 0
         self.errors: dict[int, Exception] = {}
         self.recorded: dict[str, RecordedCounts] = {}
@@ -164,7 +167,7 @@ class FrontEnd:
 
     def _say(self, index: int, line: str) -> None:
         with self._changed:
-            if line != self._said[index]:
+            if line and line != self._said[index]:
                 logger.warning("camera %s: %s", self._cameras[index].name, line)
             self._said[index] = line
 
@@ -174,12 +177,15 @@ class FrontEnd:
         # That of the middle row of a rolling shutter, as in a recording.
         time_s = frame.time_s + camera.line_time_s * frame.image.shape[0] / 2
         with self._changed:
-            self._said[index] = ""
             again = " again" if meeting.cameras[index].has_filmed else ""
             if meeting.announce(index, time_s, time.monotonic()):
                 logger.warning("camera %s films%s", camera.name, again)
         is_late = time.monotonic() - frame.arrived_s > meeting.wait_s
         image = silhouettes.look(None if is_late else frame.image)
+        if image is not None:
+            self._shown_s[index] = time_s
+        is_unseen = not is_late and time_s - self._shown_s[index] > STOPPED_S
+        self._say(index, _UNSEEN if is_unseen else "")
         with self._changed:
             meeting.put(index, time_s, image, frame.arrived_s)
             self._changed.notify_all()
@@ -208,7 +214,10 @@ class CameraSilhouettes:
     def look(
         self, frame: UInt8[np.ndarray, "height width 3"] | None
     ) -> UInt8[np.ndarray, "rows columns"] | None:
-        """The silhouette of the next frame; None for a frame that is left out. `learn` comes before the frame after."""
+        """The silhouette of the next frame; None for a frame that is left out, or does not show the scene.
+
+        `learn` comes before the frame after.
+        """
         self._num_frames += 1
         if frame is None:
             return None
@@ -222,6 +231,8 @@ class CameraSilhouettes:
                 self._ignored = ignored_pixels(ignore, self._camera.name, size_wh, settings.working_reduction)
         mask = self._background.look(image, num_frames=self._num_frames)
         self._num_frames = 0
+        if mask is None:
+            return None
         if self._ignored is not None:
             mask = np.where(self._ignored, np.uint8(0), mask)
         return coverage(mask, settings.reduction // settings.working_reduction)

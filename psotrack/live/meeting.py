@@ -35,7 +35,7 @@ class CameraCounts:
         missing: instants without a frame of the camera while it filmed.
         late: frames that came after their instant was over.
         doubled: frames that came twice.
-        left_out: frames that were not processed, because the computer was too slow.
+        left_out: frames that were not processed, because the computer was too slow, or that did not show the scene.
         stops: how often the camera stopped.
     """
 

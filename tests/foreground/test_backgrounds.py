@@ -6,6 +6,8 @@ screens change, ghosts go, and hovering drones stay foreground.
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -68,7 +70,8 @@ class TestMog2:
     ):
         """At rate 0, the background is constant: what hovers stays foreground, and leaves no ghost."""
         rng = np.random.default_rng(seed)
-        frames = rng.integers(90, 130, (num_frames, 24, 32, 3), dtype=np.uint8)
+        scene = rng.integers(100, 120, (24, 32, 3), dtype=np.uint8)
+        frames = scene + rng.integers(0, 10, (num_frames, 24, 32, 3), dtype=np.uint8)
         model = cv2.createBackgroundSubtractorMOG2(varThreshold=threshold)
         model.setBackgroundRatio(0.5)
         for number, frame in enumerate(frames, 1):
@@ -314,6 +317,88 @@ class TestLiving:
         assert mask[42:58, 80].mean() / 255 == pytest.approx(0.75, abs=0.05)
         assert mask[42:58, 81].mean() / 255 < 0.04
         assert not mask[:, 90:].any()
+
+
+# --- light that is lost
+
+NUM_FRAMES, BURST = 150, range(60, 65)
+BLACK, BLUE = np.uint8([0, 0, 0]), np.uint8([255, 0, 0])
+_noise = np.random.default_rng(8)
+#: Frames -> what the camera shows instead of each: a light that is so many times as bright, or another picture.
+LOST_LIGHT = {
+    "begins dark": {i: (i + 1) / 15 for i in range(15)},
+    "begins slowly": {i: (i + 1) / 40 for i in range(40)},
+    "begins at 30 %": dict.fromkeys(range(25), 0.3),
+    "three black at first": dict.fromkeys(range(3), BLACK),
+    "nine black at first": dict.fromkeys(range(9), BLACK),
+    "nine nearly black": {i: _noise.integers(0, 4, (HEIGHT, WIDTH, 3), np.uint8) for i in range(9)},
+    "nine grey at first": dict.fromkeys(range(9), np.uint8([128, 128, 128])),
+    "black for long": dict.fromkeys(range(30, 70), BLACK),
+    "five black": dict.fromkeys(BURST, BLACK),
+    "one black": {60: BLACK},
+    "bursts": dict.fromkeys([*range(20, 25), *BURST], BLACK),
+    "blue": dict.fromkeys(BURST, BLUE),
+    "white": dict.fromkeys(BURST, np.uint8([255, 255, 255])),
+    "another picture": {i: _exposed(_room(_noise), _noise) for i in BURST},
+    "flash": dict.fromkeys(BURST, 4.0),
+    "a tenth": dict.fromkeys(range(50, 65), 0.1),
+    "a tenth for long": dict.fromkeys(range(30, 80), 0.1),
+    "sinks and comes back": {i: 1 - 0.9 * np.exp(-(((i - 60) / 8) ** 2)) for i in range(40, 80)},
+    "a lamp flickers": {i: 0.3 for i in range(40, 90) if i // 3 % 2},
+    "dimmed for good": dict.fromkeys(range(60, 150), 0.4),
+}
+
+
+@functools.cache
+def _flight() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """A drone that crosses a room, and its pixels."""
+    rng = np.random.default_rng(9)
+    room = _room(rng)
+    drawn = [_with_drone(room, 15 + 0.9 * i, 60 + 35 * np.sin(i / 12)) for i in range(NUM_FRAMES)]
+    return [_exposed(image, rng) for image, _ in drawn], [drone for _, drone in drawn]
+
+
+def _masks(model: str, frames: list[np.ndarray]) -> list[np.ndarray | None]:
+    if model == "live":
+        return list(Living(SETTINGS).masks_as_they_come(frames))
+    return list({"living": Living, "mog2": Mog2}[model](SETTINGS).foreground(frames[::6], frames))
+
+
+@functools.cache
+def _found_in_calm_light(model: str) -> np.ndarray:
+    frames, drones = _flight()
+    found = [_f1(mask, drone) > 0.6 for mask, drone in zip(_masks(model, frames), drones, strict=True)]
+    return np.array(found)
+
+
+@pytest.mark.parametrize("model", ["living", "mog2", pytest.param("live", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", LOST_LIGHT)
+def test_light_that_is_lost_leaves_no_camera_blind(case, model):
+    """From a second after the last such frame on, the drone is found as in calm light.
+
+    Found: after five black frames it was never found again. What shows nothing is no frame of the camera.
+    """
+    shown, (frames, drones) = LOST_LIGHT[case], _flight()
+    seen = list(frames)
+    for index, other in shown.items():
+        is_gain = isinstance(other, float)
+        lit = (
+            np.clip(frames[index] * other, 0, 255).round()
+            if is_gain
+            else np.broadcast_to(other, frames[0].shape)
+        )
+        seen[index] = np.ascontiguousarray(lit, np.uint8)
+    masks = _masks(model, seen)
+    if case == "dimmed for good":
+        if model == "mog2":
+            pytest.skip("mog2 does not follow the light")
+        after = min(shown)
+    else:
+        after = max(shown) + 25
+    found = [mask is not None and _f1(mask, drone) > 0.6 for mask, drone in zip(masks, drones, strict=True)]
+    assert np.sum(found[after:]) >= 0.95 * _found_in_calm_light(model)[after:].sum()
+    if any(other is BLACK for other in shown.values()) and (model != "live" or min(shown)):
+        assert [index for index, mask in enumerate(masks) if mask is None] == list(shown)
 
 
 @pytest.mark.parametrize("strength", [20, 70, 200])

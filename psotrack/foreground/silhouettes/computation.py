@@ -27,6 +27,7 @@ from psotrack.foreground.silhouettes.settings import (
 from psotrack.foreground.silhouettes.store import (
     LEFT_OUT,
     REPEATED,
+    UNSEEN,
     Task,
     open_stored,
     reduced_shape,
@@ -57,6 +58,11 @@ _WHY_LEFT_OUT = (
         REPEATED,
         "they repeat the picture before",
         "a stream that froze, frames that were lost or are damaged, or a video converted to a higher rate?",
+    ),
+    (
+        UNSEEN,
+        "they do not show the scene",
+        "too dark, too bright, of one colour, or another picture?",
     ),
 )
 
@@ -130,7 +136,7 @@ def compute(
         arrays[name] = array
         # Without the future, whoever reads a frame decides about this frame.
         times = recording.by_name[name].times
-        if scaled.first_look and times and (intervals := _left_out(name, array, times)):
+        if times and (intervals := _left_out(name, array, times, with_future=scaled.first_look)):
             arrays[name], left_out[name] = _without(array, intervals), intervals
     shape = tuple(np.max([array.shape[1:] for array in arrays.values()], axis=0).tolist())
     nothing = np.zeros((0, *shape), np.uint8)
@@ -314,10 +320,13 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
     return {stage: sum((each[stage] for each in taken), 0.0) for stage in ("decode", "foreground")}
 
 
-def _left_out(name: str, array: zarr.Array, times: FrameTimes) -> list[Interval]:
-    """Intervals of a camera's frames that are left out, said in warnings."""
+def _left_out(name: str, array: zarr.Array, times: FrameTimes, *, with_future: bool) -> list[Interval]:
+    """Intervals of a camera's frames that are left out, said in warnings.
+
+    Without the future, only frames that do not show the scene are: a frame alone says so.
+    """
     left_out = np.zeros(times.num_frames, bool)
-    for attribute, why, remedy in _WHY_LEFT_OUT:
+    for attribute, why, remedy in _WHY_LEFT_OUT[0 if with_future else -1 :]:
         stored: Any = array.attrs.get(attribute, [])  # as JSON keeps them
         chosen = np.zeros_like(left_out)
         for start, stop in stored:

@@ -11,6 +11,7 @@ No step shifts the mask: images are reduced by whole factors, by area, and speck
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ import msgspec
 import numpy as np
 from jaxtyping import UInt8
 
+from psotrack.foreground.silhouettes.lighting import compare, light_of, show_one_scene
 from psotrack.foreground.silhouettes.settings import ForegroundSettings
 
 #: MOG2's label of shadow pixels; foreground is 255.
@@ -58,7 +60,7 @@ class BackgroundModel(Protocol):
         self,
         learning: Iterable[UInt8[np.ndarray, "height width 3"]],
         frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
         """The foreground of each of `frames`, against the background of `learning`.
 
         Both iterables decode the video while they are read, each at most once; a list of all frames may not fit in
@@ -70,9 +72,10 @@ class BackgroundModel(Protocol):
             frames: (height, width, 3) uint8 BGR frames, all frames in their order.
 
         Yields:
-            One uint8 mask per frame: 0 for background, 255 for foreground, values between them for foreground of less
-            weight. A mask has the height and width of the frame, divided by `silhouettes.working_reduction` and
-            rounded up; pixel (i, j) covers the frame's pixels [r * i, r * i + r) x [r * j, r * j + r).
+            One uint8 mask per frame, or None for a frame that does not show the scene, which is left out as if the
+            camera had no frame then. 0 is background, 255 foreground, values between them foreground of less weight. A
+            mask has the height and width of the frame, divided by `silhouettes.working_reduction` and rounded up; pixel
+            (i, j) covers the frame's pixels [r * i, r * i + r) x [r * j, r * j + r).
         """
         ...
 
@@ -96,27 +99,36 @@ class Mog2:
         self,
         learning: Iterable[UInt8[np.ndarray, "height width 3"]],
         frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
         """See `BackgroundModel`: values between 0 and 255 are weighted shadow."""
         settings = self.settings
         model = learned_mog2(((1.0, reduce_frame(frame, settings)) for frame in learning), settings)
         levels = _levels(settings)
         least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
+        light = light_of(model.getBackgroundImage())
         for frame in frames:
-            labels = model.apply(reduce_frame(frame, settings), learningRate=settings.learning_rate)
+            image = reduce_frame(frame, settings)
+            if math.isinf(compare(image, light).log_gain):
+                yield None
+                continue
+            labels = model.apply(image, learningRate=settings.learning_rate)
             yield remove_speckle(cv2.LUT(labels, levels), least_px)
 
 
 def learned_mog2(
     images: Iterable[tuple[float, _Image]], settings: ForegroundSettings
 ) -> cv2.BackgroundSubtractorMOG2:
-    """OpenCV's MOG2 after it learned the background from weights and reduced images; their order does not matter."""
+    """OpenCV's MOG2 after it learned the background from weights and reduced images; their order does not matter.
+
+    It learns from the images that show the scene of most of them, in nearly the same light.
+    """
     model = cv2.createBackgroundSubtractorMOG2(
         history=settings.num_learning_frames, varThreshold=settings.var_threshold, detectShadows=True
     )
     model.setBackgroundRatio(_BACKGROUND_RATIO)
-    total = 0.0
-    for weight, image in images:
+    total, learning = 0.0, list(images)
+    chosen = show_one_scene([image for _, image in learning], [weight for weight, _ in learning])
+    for weight, image in itertools.compress(learning, chosen):
         # The rate 1/n gives the mean of n frames; MOG2's own schedule gives the last frames more weight.
         total += weight
         model.apply(image, learningRate=weight / total)

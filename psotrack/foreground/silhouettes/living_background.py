@@ -3,6 +3,8 @@
 `LivingBackground` sees one frame after the other, in one pass, from a file or from a live camera. Each frame goes
 through:
 
+0. a frame that does not show the scene is left out, never learned from, and counts as no frame; one that shows another
+   scene, or the same in a light too different to be followed, begins a new background if that lasts;
 1. the change of the light is removed (`lighting`);
 2. MOG2 (Zivkovic, ICPR 2004) tells which pixels differ from all that they showed lately;
 3. the blobs of these pixels that are objects become foreground (`object_blobs`); how much a blob must differ depends on
@@ -16,6 +18,7 @@ show, and the first two seconds are seen twice.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,7 +30,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.foreground.silhouettes.foreground import learned_mog2, reduce_frame
-from psotrack.foreground.silhouettes.lighting import light_of, remove_light
+from psotrack.foreground.silhouettes.lighting import (
+    LEAST_DIFFERENCE,
+    Comparison,
+    Light,
+    compare,
+    light_of,
+    remove_light,
+)
 from psotrack.foreground.silhouettes.object_blobs import ObjectBlobs, find_objects, gradient, largest
 from psotrack.foreground.silhouettes.settings import ForegroundSettings
 
@@ -46,8 +56,6 @@ _SHADOW_BRIGHTNESS = 0.85
 #: and the background, and look like a shadow.
 _TOUCHING = np.ones((5, 5), np.uint8)
 
-#: Smallest difference of a strong pixel, grey levels of a channel: four times the noise of a good camera.
-_LEAST_DIFFERENCE = 8.0
 #: A pixel is strong if it differs by this many times the place's usual deviation (root of the mean square).
 _DEVIATIONS = 4.0
 #: A strong pixel also differs by more than this many times the place's mean change within `_CHANGE_EVERY` frames.
@@ -102,7 +110,7 @@ class Living:
         self,
         learning: Iterable[UInt8[np.ndarray, "height width 3"]],
         frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
         """See `BackgroundModel`."""
         settings = self.settings
         return self.masks(
@@ -110,7 +118,7 @@ class Living:
             (reduce_frame(frame, settings) for frame in frames),
         )
 
-    def masks_as_they_come(self, frames: Iterable[_Image]) -> Iterator[_Mask]:
+    def masks_as_they_come(self, frames: Iterable[_Image]) -> Iterator[_Mask | None]:
         """Yield the foreground of each frame, from what was seen before it, as of a live camera.
 
         Args:
@@ -121,7 +129,9 @@ class Living:
             background = LivingBackground(self.settings, frame) if background is None else background
             yield background.step(frame)
 
-    def masks(self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]) -> Iterator[_Mask]:
+    def masks(
+        self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]
+    ) -> Iterator[_Mask | None]:
         """Yield the foreground of each of `frames`, as `foreground` does.
 
         Args:
@@ -148,28 +158,91 @@ class _Look(NamedTuple):
     differs: _Mask
     labels: _Mask
     found: ObjectBlobs
+    log_gain: float
 
 
 class LivingBackground:
-    """The background of one camera, which changes with each frame.
+    """The background of one camera, which changes with each frame; a second one waits for its scene to come back.
 
     Args:
         settings: settings of the foreground; `working_reduction`, `min_blob_px` and `soft_edges` are used.
         image: (height, width, 3), BGR, the background as far as it is known: the first frame of a live camera, or what
             most of a video's frames show. Of the frames' size.
         num_frames: number of frames that show this background: the more, the less a new frame changes the background.
+    """
+
+    def __init__(self, settings: ForegroundSettings, image: _Image, num_frames: int = 1) -> None:
+        self._settings = settings
+        self._scene = _Scene(settings, image, num_frames)
+        self._other: _Scene | None = None
+        self._num_changed, self._is_left_out = 0, False
+
+    def step(self, image: _Image, known: _Mask | None = None, *, num_frames: int = 1) -> _Mask | None:
+        """The foreground of the next frame; learns from the frame: `look`, then `learn`."""
+        foreground = self.look(image, num_frames=num_frames)
+        self.learn(known)
+        return foreground
+
+    def look(self, image: _Image, *, num_frames: int = 1) -> _Mask | None:
+        """The foreground of the next frame; `learn` is to be called before the frame after it.
+
+        Args:
+            image: (height, width, 3), BGR frame.
+            num_frames: number of frames for which this one stands, where frames were left out before it.
+
+        Returns:
+            (height, width): 0 for background, 255 for foreground; with soft edges, at and beside contours the share of
+            the pixel that is foreground. None for a frame that does not show the scene.
+        """
+        log_gain, lasting_frames = self._compare(image)
+        self._num_changed = self._num_changed + num_frames if log_gain else 0
+        if self._num_changed > lasting_frames:
+            is_other = math.isinf(log_gain)
+            begun = _Scene(self._settings, image) if is_other else self._scene.in_light(math.exp(log_gain))
+            # The background that is known for longer is kept.
+            if self._other is None or self._other.num_known < self._scene.num_known:
+                self._other = self._scene
+            self._scene, self._num_changed, log_gain = begun, 0, 0.0
+        self._is_left_out = math.isinf(log_gain)
+        if self._is_left_out:
+            return None
+        return self._scene.look(image, log_gain, num_frames)
+
+    def learn(self, known: _Mask | None = None) -> None:
+        """Learn from the last frame.
+
+        Args:
+            known: (height, width), above 0 where a drone is known to be, for example by a tracker's prediction: these
+                pixels are not learned. None: nothing is known.
+        """
+        if not self._is_left_out:
+            self._scene.learn(known)
+
+    def _compare(self, image: _Image) -> Comparison:
+        """Compare a frame with the scene; where the light changed much, with the other one if that is nearer."""
+        found = compare(image, self._scene.light)
+        if found.log_gain and self._other is not None:
+            before = compare(image, self._other.light)
+            if abs(before.log_gain) < abs(found.log_gain):
+                self._scene, self._other, found = self._other, self._scene, before
+        return found
+
+
+class _Scene:
+    """What a camera shows in one light: see `LivingBackground`.
 
     Attributes:
-        foreground: (height, width), the foreground of the last frame, 0 or 255, without soft edges.
+        light: the light of the background.
+        num_known: number of frames that have shown the background.
     """
+
+    light: Light
 
     def __init__(self, settings: ForegroundSettings, image: _Image, num_frames: int = 1) -> None:
         self._soft_edges = settings.soft_edges
         self._least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
-        self._mog2 = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
-        self._mog2.setShadowThreshold(_SHADOW_BRIGHTNESS)
-        self._mog2.apply(image, learningRate=1)
         self._background: Float[np.ndarray, "height width 3"] = image.astype(np.float32)
+        self._begin_mog2()
         shape = image.shape[:2]
         self._square = np.zeros(shape, np.float32)
         self._change = np.zeros(shape, np.float32)
@@ -179,93 +252,109 @@ class LivingBackground:
         self._num_updates = 0
         self._num_learned, self._num_changed, self._expected_until = 0, 0, 0
         self._objects = np.zeros(shape, np.uint8)
-        self.foreground: _Mask = np.zeros(shape, np.uint8)
+        self._foreground: _Mask = np.zeros(shape, np.uint8)
         self._expect()
 
-    def step(self, image: _Image, known: _Mask | None = None, *, num_frames: int = 1) -> _Mask:
-        """The foreground of the next frame; learns from the frame: `look`, then `learn`."""
-        foreground = self.look(image, num_frames=num_frames)
-        self.learn(known)
-        return foreground
+    def _begin_mog2(self, variance: float | None = None) -> None:
+        self._mog2 = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
+        self._mog2.setShadowThreshold(_SHADOW_BRIGHTNESS)
+        if variance is not None:
+            self._mog2.setVarInit(variance)
+        self._mog2.apply(np.asarray(cv2.convertScaleAbs(self._background)), learningRate=1)
 
-    def look(self, image: _Image, *, num_frames: int = 1) -> _Mask:
-        """The foreground of the next frame; `learn` is to be called before the frame after it.
+    @property
+    def num_known(self) -> int:
+        return self._num_before + self._num_frames
 
-        Args:
-            image: (height, width, 3), BGR frame.
-            num_frames: number of frames for which this one stands, where frames were left out before it.
+    def in_light(self, gain: float) -> _Scene:
+        """The same scene in a light that is `gain` times as bright."""
+        scene = copy.copy(self)
+        scene._background = np.minimum(gain * self._background, 255)
+        scene._square, scene._change = gain**2 * self._square, gain * self._change
+        scene._last = cv2.convertScaleAbs(self._last, alpha=gain)
+        least, usual = self._mog2.getVarMin(), self._mog2.getVarInit()
+        scene._begin_mog2(max(least, usual * min(1.0, gain**2)))
+        scene._expected_until = 0
+        scene._expect()
+        return scene
 
-        Returns:
-            (height, width): 0 for background, 255 for foreground; with soft edges, at and beside contours the share of
-            the pixel that is foreground.
-        """
+    def look(self, image: _Image, log_gain: float, num_frames: int) -> _Mask:
         self._num_frames += num_frames
-        image = remove_light(image, self._light, self.foreground)
-        difference = largest(cv2.absdiff(image, self._light.background))
+        image = remove_light(image, self.light, self._foreground, log_gain)
+        difference = largest(cv2.absdiff(image, self.light.background))
+        usual, least = self._usual, self._least
+        if log_gain:
+            # In the frame's own light, in which its noise is that of any frame.
+            difference = cv2.convertScaleAbs(difference, alpha=math.exp(log_gain))
+            usual, least = self._limits(math.exp(log_gain))
         # MOG2 is asked only about pixels that differ, which takes a fraction of the time.
-        differs = cv2.compare(difference, self._least, cv2.CMP_GT)
+        differs = cv2.compare(difference, least, cv2.CMP_GT)
         labels = cv2.bitwise_and(self._mog2.apply(image, cv2.bitwise_not(differs), None, 0), differs)
         touching = cv2.dilate(_white(labels == _FOREGROUND), _TOUCHING)
         changed = cv2.bitwise_and(touching, _white(labels > 0))
-        strong = cv2.bitwise_and(changed, cv2.compare(difference, self._usual, cv2.CMP_GT))
+        strong = cv2.bitwise_and(changed, cv2.compare(difference, usual, cv2.CMP_GT))
         found = find_objects(changed, strong, difference, self._is_restless, self._least_px)
-        self._last_look = _Look(image, difference, differs, labels, found)
-        self.foreground = found.mask
+        self._last_look = _Look(image, difference, differs, labels, found, log_gain)
+        self._foreground = found.mask
         return _with_soft_edges(found.mask, difference) if self._soft_edges else found.mask
 
-    def learn(self, known: _Mask | None = None) -> None:
-        """Learn from the last frame.
-
-        Args:
-            known: (height, width), above 0 where a drone is known to be, for example by a tracker's prediction: these
-                pixels are not learned. None: nothing is known.
-        """
-        at_first = self._num_before + self._num_frames <= _ALL_LEARNED
+    def learn(self, known: _Mask | None) -> None:
+        at_first = self.num_known <= _ALL_LEARNED
         if at_first or self._num_frames - self._num_learned >= _LEARN_EVERY:
             look = self._last_look
-            objects = look.found.with_own_edges(look.image, self._light.background)
+            objects = look.found.with_own_edges(look.image, self.light.background)
             objects = objects if known is None else objects | known
-            self._learn(look.image, look.labels, look.difference, objects, cv2.bitwise_not(look.differs))
+            self._learn(look, objects)
             self._expect()
 
-    def _learn(self, image: _Image, labels: _Mask, difference: _Mask, objects: _Mask, same: _Mask) -> None:
+    def _learn(self, look: _Look, objects: _Mask) -> None:
         # A part of an object that one frame does not show is not learned at once.
         protected = cv2.dilate(objects | self._objects, _MARGIN)
         self._objects = objects
         free = cv2.bitwise_not(protected)
         num_frames, self._num_learned = self._num_frames - self._num_learned, self._num_frames
         # At first each frame has the same weight.
-        learning_rate = max(_LEARNING_RATE, 1 / (self._num_before + self._num_frames))
+        learning_rate = max(_LEARNING_RATE, 1 / (self.num_known))
         # MOG2 takes long, and most pixels show the background as it is known: they are learned less often.
         self._num_updates += 1
-        known = protected if self._num_updates % _ALL_EVERY == 0 else cv2.bitwise_or(protected, same)
-        self._mog2.apply(image, known, None, _of_frames(learning_rate, num_frames))
-        cv2.accumulateWeighted(image, self._background, _of_frames(learning_rate, num_frames), free)
+        known = (
+            protected
+            if self._num_updates % _ALL_EVERY == 0
+            else cv2.bitwise_or(protected, cv2.bitwise_not(look.differs))
+        )
+        self._mog2.apply(look.image, known, None, _of_frames(learning_rate, num_frames))
+        cv2.accumulateWeighted(look.image, self._background, _of_frames(learning_rate, num_frames), free)
+        if look.log_gain:
+            return  # what a large change of the light leaves is not usual
         rate = max(_USUAL_RATE, 1 / (self._num_frames + _CALM_FRAMES))
-        unexplained = cv2.bitwise_and(difference, difference, mask=labels)
+        unexplained = cv2.bitwise_and(look.difference, look.difference, mask=look.labels)
         square = cv2.multiply(unexplained, unexplained, dtype=cv2.CV_32F)
         cv2.accumulateWeighted(square, self._square, _of_frames(rate, num_frames), free)
         num_frames = self._num_frames - self._num_changed
         if num_frames >= _CHANGE_EVERY:
             # A hovering drone hardly changes, a screen does: so this is learned at objects too.
-            change = largest(cv2.absdiff(image, self._last)).astype(np.float32)
-            change = np.minimum(change, _COUNTED_CHANGES * self._change + _LEAST_DIFFERENCE)
+            change = largest(cv2.absdiff(look.image, self._last)).astype(np.float32)
+            change = np.minimum(change, _COUNTED_CHANGES * self._change + LEAST_DIFFERENCE)
             cv2.accumulateWeighted(change, self._change, _of_frames(rate, num_frames))
-            self._last, self._num_changed = image, self._num_frames
+            self._last, self._num_changed = look.image, self._num_frames
 
     def _expect(self) -> None:
         """What the next frames are compared with, and by how much they may differ, which changes slowly."""
-        self._light = light_of(self._background)
+        self.light = light_of(self._background)
         if self._num_frames < self._expected_until:
             return
         self._expected_until = self._num_frames + _USUAL_EVERY
-        restless = self._restlessness()
+        self._restless = self._restlessness()
         # A small shift of the image changes the pixels beside edges.
-        shifted = _SHIFT_PX / 2 * cv2.dilate(gradient(self._light.background), np.ones((3, 3), np.uint8))
-        usual = np.maximum(np.maximum(restless, shifted), _LEAST_DIFFERENCE)
-        self._usual = _levels(usual)
-        self._least = _levels(np.maximum(_EXTENT * restless, _LEAST_CHANGE))
-        self._is_restless = restless > 2 * _LEAST_DIFFERENCE
+        shifted = _SHIFT_PX / 2 * cv2.dilate(gradient(self.light.background), np.ones((3, 3), np.uint8))
+        self._explained = np.maximum(self._restless, shifted)
+        self._usual, self._least = self._limits()
+        self._is_restless = self._restless > 2 * LEAST_DIFFERENCE
+
+    def _limits(self, gain: float = 1.0) -> tuple[_Mask, _Mask]:
+        """Differences beyond which a pixel is strong, and differs at all, in a light that is `gain` times as bright."""
+        usual = np.maximum(gain * self._explained, LEAST_DIFFERENCE)
+        return _levels(usual), _levels(np.maximum(_EXTENT * gain * self._restless, _LEAST_CHANGE))
 
     def _restlessness(self) -> Float[np.ndarray, "height width"]:
         """(height, width), difference that leaves, screens, waves and noise make at a place, grey levels."""

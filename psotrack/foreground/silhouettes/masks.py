@@ -86,8 +86,11 @@ def _write_camera(both: tuple[Task, Path], advance: Advance) -> None:
     """Write the masks of one video to a folder or a video file."""
     task, out = both
     (width, height), reduction = task.video.image_size_wh, task.settings.working_reduction
+    nothing = np.zeros((height, width), np.uint8)
     masks = (
-        np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
+        nothing
+        if mask is None
+        else np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
         for mask in foreground_of(task, {"decode": 0.0}, advance)
     )
     codec = _CODECS.get(out.suffix.lower())

@@ -80,8 +80,8 @@ SCHEMA = 2
 CHUNK_FRAMES = 25
 
 #: Attributes of stored silhouettes: intervals of the frames in which the foreground makes no sense, and of those that
-#: repeat the picture before.
-LEFT_OUT, REPEATED = "left_out", "repeated"
+#: repeat the picture before, or do not show the scene.
+LEFT_OUT, REPEATED, UNSEEN = "left_out", "repeated", "unseen"
 
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
@@ -218,16 +218,24 @@ def _write(
         config={"write_empty_chunks": True},
     )
     chunk, everywhere = np.empty((CHUNK_FRAMES, *shape[1:]), np.uint8), [np.zeros(0, bool)]
-    changes = FrameChanges()
+    changes, unseen = FrameChanges(), np.zeros(video.num_frames, bool)
     for index, mask in enumerate(foreground_of(task, seconds, advance, changes)):
-        chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
+        unseen[index] = mask is None
+        chunk[index % CHUNK_FRAMES] = (
+            0 if mask is None else coverage(mask, settings.reduction // settings.working_reduction)
+        )
         count = index % CHUNK_FRAMES + 1
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
             array[index + 1 - count : index + 1] = chunk[:count]
             everywhere.append(foreground_is_everywhere(chunk[:count]))
             _move_to_disk(files, folder)
-    array.update_attributes({LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
-    array.update_attributes({REPEATED: intervals_of(repeated_frames(changes.found))})
+    # A camera that shakes shows its scene in none of these frames, or foreground everywhere.
+    is_everywhere, is_long = np.concatenate(everywhere), np.zeros(video.num_frames, bool)
+    for start, stop in intervals_of(is_everywhere | unseen, LEAST_FRAMES):
+        is_long[start:stop] = True
+    shaken = intervals_of(is_everywhere & is_long)
+    repeated = intervals_of(repeated_frames(changes.found) & ~unseen)
+    array.update_attributes({LEFT_OUT: shaken, REPEATED: repeated, UNSEEN: intervals_of(unseen)})
     _move_to_disk(files, folder)
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
 
@@ -241,8 +249,10 @@ def _move_to_disk(files: dict[str, Buffer], folder: Path) -> None:
 
 def foreground_of(
     task: Task, seconds: dict[str, float], advance: Advance, changes: FrameChanges | None = None
-) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
+) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
     """Yield the mask of each frame, without what is ignored: 0 to 255, a pixel per `working_reduction` pixels.
+
+    None stands for the mask of a frame that does not show the scene.
 
     Args:
         task: the video, the settings and the background model.
@@ -273,9 +283,9 @@ def foreground_of(
     count = 0
     for count, mask in enumerate(masks, 1):
         kind = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
-        if kind != f"uint8 {shape}" or count > video.num_frames:
+        if (mask is not None and kind != f"uint8 {shape}") or count > video.num_frames:
             raise _wrong_masks(task, shape, f"{kind} as mask {count - 1}")
-        yield mask if ignored is None else np.where(ignored, np.uint8(0), mask)
+        yield mask if ignored is None or mask is None else np.where(ignored, np.uint8(0), mask)
     if count < video.num_frames:
         raise _wrong_masks(task, shape, f"{count} masks")
 
