@@ -31,9 +31,9 @@ class Silhouettes:
         arrays: one array (frames, height, width) per camera, stored or in memory; cameras may differ in frames, height
             and width. A camera without silhouettes has no frames.
         exposures: when the frames were exposed; None where frame i of every camera is instant i.
-        left_out: frames of a camera's video in which foreground is everywhere, which repeat the picture before, or which
-            do not show the scene, as intervals (first frame, frame after the last), by camera name; these frames show
-            no foreground in `arrays`, and `at_instants` says that the camera sees nothing.
+        left_out: frames of a camera's video in which foreground is everywhere, which repeat the picture before, or
+            which do not show the scene, as intervals (first frame, frame after the last), by camera name; these frames
+            show no foreground in `arrays`, and `at_instants` says that the camera sees nothing.
     """
 
     cameras: tuple[str, ...]
