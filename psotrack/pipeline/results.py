@@ -14,9 +14,10 @@ from typing import Any
 import jax
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack.errors import InputError
+from psotrack.geometry import in_images
 from psotrack.pipeline.inputs import Run
 from psotrack.settings import BLOBS, DroneSettings, TrackSettings, flatten
 from psotrack.support import html_block, html_lines, identify
@@ -29,13 +30,15 @@ from psotrack.tracking.births import (
 )
 from psotrack.tracking.camera_errors import TrackErrors
 from psotrack.tracking.identity import Identities, postprocess
-from psotrack.trajectories import Tracks, Trajectories, drones_html
+from psotrack.trajectories import Status, Tracks, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)
 
 #: Where detections of different cameras meet in a smaller share of the frames, something is wrong with the cameras:
 #: rays of false detections meet by chance.
 _FEW_MET = 0.2
+#: A camera that shows nothing in a larger share of the instants at which it should, and for a second, is named.
+_BLIND_SHARE = 0.5
 #: Settings that the data give where nobody does, and the key of the record's `volume` that says which.
 _FOUND = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
 
@@ -207,6 +210,32 @@ def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:
     count = settings.drones.count
     if count is not None and num_drones < count:
         logger.warning("--drones %d: only %d drones were seen; the tracks have no others", count, num_drones)
+
+
+def warn_of_blind_cameras(run: Run, tracks: Tracks, shown: Bool[np.ndarray, "frames drones cameras"]) -> None:
+    """Name the cameras that show no drone in most of the instants at which they should, by the tracks.
+
+    Args:
+        run: the run.
+        tracks: its tracks.
+        shown: (frames, drones, cameras), whether a camera shows a drone.
+    """
+    found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
+    in_view = found & in_images(run.recording.rig.cameras, np.asarray(tracks.position_m, np.float64))
+    exposures = None if run.silhouettes is None else run.silhouettes.exposures
+    there = run.recording.timeline().is_there if exposures is None else np.asarray(exposures.is_there)
+    should = in_view.any(axis=1) & there
+    for name, of_camera, blind in zip(
+        run.recording.rig.names, should.T, (should & ~shown.any(axis=1)).T, strict=True
+    ):
+        if blind.sum() > max(_BLIND_SHARE * of_camera.sum(), run.recording.fps):
+            logger.warning(
+                "camera %s shows no drone in %d of the %d instants at which the tracks have one in its view; "
+                "look at what it sees: `psotrack detect --silhouettes`",
+                name,
+                blind.sum(),
+                of_camera.sum(),
+            )
 
 
 def _no_drones(run: Run) -> InputError:

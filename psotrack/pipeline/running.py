@@ -44,6 +44,7 @@ from psotrack.pipeline.results import (
     MethodResult,
     TrackedRecording,
     finish,
+    warn_of_blind_cameras,
     with_real_time,
 )
 from psotrack.recordings import Recording
@@ -221,6 +222,7 @@ def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResu
 
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found
+        warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
         result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, shares)
         return _with_camera_errors(run, result, places, silhouettes.exposures)
 
@@ -244,6 +246,8 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
             report=report,
         )
     seconds["track"] += run.read_s
+    if not run.by_swarm:
+        warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
     return _with_camera_errors(run, result, places)
 
