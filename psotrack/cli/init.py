@@ -69,7 +69,7 @@ def init(
         match: FILE of FOLDER, or address of a stream, that belongs to CAMERA; may be repeated.
         leave_out: file of FOLDER that is not used; may be repeated.
         fps: frames per second of cameras that have images or detections only.
-        size_wh: size of the images of cameras that have detections only, if the rig file does not state it.
+        size_wh: size of the images of cameras that have detections only, if the rig file states none or another one.
         out: file to write. None: FOLDER/recording.toml.
         show: show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.
     """

@@ -48,7 +48,7 @@ class LensSettings:
             are left out.
         lenses: calibration whose lenses are kept; a camera that is not in the file gets a lens from the board.
         fov_deg: horizontal and vertical field of view in degrees, with `size`, instead of `lenses`.
-        size: size of the images in pixels, if no file states it.
+        size: size of the images in pixels, if no file states it; lenses for another one of the same shape are rescaled.
     """
 
     lens: Annotated[str, Meta(extra={"metavar": "auto|0|4|5|8|12|14|fisheye"})] = "auto"

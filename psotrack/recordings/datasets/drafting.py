@@ -48,7 +48,7 @@ class DraftOptions:
         match: file, folder of images or address of a stream by the name of its camera.
         leave_out: names of files of the folder that are not used.
         fps: frames per second of cameras without a video and without frame times.
-        size_wh: width and height of cameras without video whose size the calibration does not state, pixels.
+        size_wh: width and height of cameras without video, pixels, where the calibration states none or another one.
         bodies: labels of the markers of each drone in the C3D file; empty: by the labels.
     """
 
