@@ -39,6 +39,8 @@ class Scene:
         size_m: width and height of a drone, metres.
         focal_px: focal length, pixels.
         arc_deg: part of the circle on which the cameras stand.
+        missed, false_alarms: share of the boxes that are missing, and mean number of false ones in an image.
+        lasting: number of things in each image, such as a chair, that are taken for a drone in every second frame.
     """
 
     num_cameras: int
@@ -51,6 +53,9 @@ class Scene:
     size_m: tuple[float, float] = (0.5, 0.2)
     focal_px: float = 1200.0
     arc_deg: float = 360.0
+    missed: float = 0.1
+    false_alarms: float = 0.3
+    lasting: int = 0
 
 
 #: The scenes of the comparison.
@@ -75,6 +80,34 @@ SCENES = {
     ),
     "outdoors, 2 cameras, 3 hovering drones": Scene(
         2, 30.0, 1.5, (0, 0, 12), (10, 10, 5), (0.0, 0.2), 3, arc_deg=120.0
+    ),
+    "indoors, 4 cameras around 3 walking people": Scene(
+        4,
+        7.0,
+        2.6,
+        (0, 0, 0.85),
+        (3.5, 3.5, 0),
+        (1, 1.5),
+        3,
+        (0.55, 1.7),
+        1000.0,
+        missed=0.15,
+        false_alarms=1.0,
+        lasting=2,
+    ),
+    "indoors, 4 cameras around 3 small drones": Scene(
+        4,
+        7.0,
+        2.6,
+        (0, 0, 1.3),
+        (3, 3, 0.8),
+        (0.5, 2.5),
+        3,
+        (0.12, 0.06),
+        1000.0,
+        missed=0.15,
+        false_alarms=1.0,
+        lasting=2,
     ),
     "outdoors, 3 cameras, 4 hovering and slow drones": Scene(
         3, 35.0, 1.5, (0, 0, 14), (12, 12, 6), (0.0, 1.0), 4, arc_deg=120.0
@@ -131,21 +164,12 @@ def sines(scene: Scene, num_frames: int, rng: np.random.Generator) -> Float[np.n
     return np.stack(paths, axis=1)
 
 
-def make_flight(scene: Scene, num_frames: int, seed: int, *, false_alarms: float = 0.3) -> Flight:
-    """One flight of a scene.
-
-    Args:
-        scene: rig and volume.
-        num_frames: number of frames.
-        seed: seed of the random numbers.
-        false_alarms: mean number of false alarms per image.
-    """
+def make_flight(scene: Scene, num_frames: int, seed: int) -> Flight:
+    """One flight of a scene of a number of frames."""
     rng = np.random.default_rng(seed)
     rig = ring(scene, rng)
     truth_m = sines(scene, num_frames, rng)
-    detections = {
-        name: _detect(scene, rig, camera, truth_m, false_alarms, rng) for camera, name in enumerate(rig.names)
-    }
+    detections = {name: _detect(scene, rig, camera, truth_m, rng) for camera, name in enumerate(rig.names)}
     frame = np.arange(num_frames)
     names = tuple(f"dron{number + 1}" for number in range(scene.num_drones))
     seen = _in_view(rig, truth_m).sum(axis=-1) >= 2
@@ -165,7 +189,6 @@ def _detect(
     rig: Rig,
     camera: int,
     truth_m: Float[np.ndarray, "frames drones 3"],
-    false_alarms: float,
     rng: np.random.Generator,
 ) -> Detections:
     """Boxes of one camera in all frames."""
@@ -182,15 +205,20 @@ def _detect(
     # A post as wide as a few drones hides what is behind it.
     post_px = rng.uniform(300, 1600)
     hidden = np.abs(pixels[..., 0] - post_px) < 1.5 * np.median(size_px[..., 0])
-    kept = inside & ~hidden & (rng.random(inside.shape) >= 0.1)
+    kept = inside & ~hidden & (rng.random(inside.shape) >= scene.missed)
     bird = _bird(len(truth_m), rng)
+    half_px = np.median(size_px, axis=(0, 1)) / 2
+    lasting = rng.uniform(half_px, IMAGE_SIZE_WH - half_px, (scene.lasting, 2))
     frame, boxes = [], []
     for number in range(len(truth_m)):
         some = np.concatenate([middle - size_px / 2, middle + size_px / 2], axis=-1)[number, kept[number]]
         found = _merged(some.tolist())
-        for _ in range(rng.poisson(false_alarms)):
+        for _ in range(rng.poisson(scene.false_alarms)):
             corner = rng.random(2) * (np.array(IMAGE_SIZE_WH) - 40)
             found.append([*corner, *(corner + rng.uniform(8, 40, 2))])
+        there = lasting + rng.normal(0, noise_px, lasting.shape)
+        for place in there[rng.random(scene.lasting) < 0.5]:
+            found.append([*(place - half_px), *(place + half_px)])
         if np.isfinite(bird[number]).all():
             found.append([*(bird[number] - 8), *(bird[number] + 8)])
         frame += [number] * len(found)
