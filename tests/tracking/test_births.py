@@ -421,7 +421,7 @@ class Lost:
     doubtful: bool = False
 
 
-def lost_tracks(*lost, left_m=()):
+def lost_tracks(*lost, left_m=(), new_per_s=0.0):
     """The drones numbered from 10 on, and places that ghosts left."""
     instants = [NOW - round(one.ago_s * FPS) for one in lost]
     spans_m = np.array([one.span_m for one in lost]).reshape(-1, 1)
@@ -433,6 +433,8 @@ def lost_tracks(*lost, left_m=()):
         size_m=spans_m * [1.0, 1.0, 0.5],
         doubtful=np.array([one.doubtful for one in lost], bool),
         left_m=np.array(left_m, float).reshape(-1, 3),
+        region_m=ROOM_M,
+        new_per_s=new_per_s,
     )
 
 
@@ -529,6 +531,19 @@ def test_a_fading_ghost_is_not_new():
     assert assigned_drones([dying], lost_tracks(Lost(left_m[0], STILL_M_S, 5.0), left_m=left_m)) == [0]
 
 
+def test_where_new_drones_come_a_lost_one_that_is_expected_anywhere_does_not_come_back():
+    """Of two drones lost long ago and a moment ago; one comes in every two seconds."""
+    often = {"new_per_s": 0.5}
+    for found, gone, known, expected in (
+        (replace(HERE, size_m=LARGE.span_m * np.ones(3)), LARGE, {}, 0),
+        (replace(HERE, size_m=LARGE.span_m * np.ones(3)), LARGE, often, NEW),
+        (HERE, AHEAD, often, 0),
+        (HERE, replace(AWAY, velocity_m_s=(4.0, 0.0, 0.0), ago_s=1.5), often, NEW),
+        (DEPARTING, STOOD, often, 0),
+    ):
+        assert assigned_drones([found], lost_tracks(gone, **known)) == [expected]
+
+
 def test_only_so_many_candidates_are_drones():
     found = [candidate(), candidate((1.0, 1.0, 1.0)), candidate((-1.0, 1.0, 1.0))]
     assert sorted(assigned_drones(found, lost_tracks(), max_births=2)) == [NO_DRONE, NEW, NEW]
@@ -593,11 +608,11 @@ def tracked_frames(*rows):
     return np.array([[letter == "x" for letter in row] for row in rows]).T
 
 
-def lost_in(position_m, velocity_m_s, tracked, *, fps):
+def lost_in(position_m, velocity_m_s, tracked, *, fps, counted=False):
     """The lost drones, where every instant has a frame."""
     size_m = np.full((len(tracked[0]), 3), 0.5)
     instant = np.arange(len(tracked))
-    return find_lost_tracks(position_m, velocity_m_s, tracked, size_m, instant=instant, fps=fps)
+    return find_lost_tracks(position_m, velocity_m_s, tracked, size_m, instant, fps, counted=counted)
 
 
 def test_lost_drones_by_hand():
@@ -624,6 +639,11 @@ def test_lost_drones_by_hand():
     np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [1.0, 4.5, 0.0, 1.5])
     np.testing.assert_array_equal(gone.instant, [2, 9, 1, 3])
     assert gone.doubtful.tolist() == [False, False, True, False]
+    # Those that are found in the first ten frames were there.
+    assert gone.new_per_s == 0.5 / 6
+    tracked[:11, 0] = False
+    assert lost_in(position, position / 2, tracked, fps=2.0).new_per_s == 1.5 / 6
+    assert lost_in(position, position / 2, tracked, fps=2.0, counted=True).new_per_s == 0
 
 
 def test_a_track_that_never_moved_where_a_drone_was_is_false():

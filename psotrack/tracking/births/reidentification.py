@@ -1,6 +1,7 @@
 """Re-identification: assign track candidates to lost drones.
 
-A candidate is a lost drone if time, motion and size agree, and else a new drone. A drone that stood still when it was
+A candidate is a lost drone if time, motion and size agree better than with a new drone: where new drones come often, a
+track soon ends, because its prediction tells the drone from none of the next ones. A drone that stood still when it was
 lost, or that was at the floor, is most probably still there: it has landed, or the background model has learned it.
 When such a drone departs, its place becomes foreground that does not move, a ghost. The candidate that departs from
 this place is the drone, even if the drone's track follows the ghost by then.
@@ -15,7 +16,14 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
-from psotrack.tracking.births.births import SPANS_M, SPEED_SHARE, FlightLimits, TrackCandidate
+from psotrack.tracking.births.births import (
+    RETURNED_FOUND,
+    SPANS_M,
+    SPEED_SHARE,
+    WINDOW_FRAMES,
+    FlightLimits,
+    TrackCandidate,
+)
 
 #: Value of an assignment: the candidate is a new drone.
 NEW = -1
@@ -33,8 +41,12 @@ STILL_S = (1.0, 0.5)
 #: A candidate stayed at a place, or departed from it, if it is nearer to the place than this number of spans, or was so
 #: within the last `DEPARTURE_S` seconds.
 STAYED_SPANS, DEPARTURE_S = 0.6, 0.6
-#: Odds of a new drone against a lost drone that may be anywhere, and of no drone if the candidate does not move.
+#: Odds of a new drone against a lost drone where no new ones come, and of no drone if the candidate does not move.
 NEW_ODDS, NO_DRONE_ODDS = 0.1, 10.0
+#: Number of drones that are taken to have come before the first one did: Jeffreys' prior of a rate.
+CAME_BEFORE = 0.5
+#: New drones come where drones were found, and this far about it, metres: a few flights do not show all of the region.
+AROUND_M = 1.0
 #: Two drones are at the same place if their distance, divided along each axis by this share of their mean size, is
 #: below 1.
 SAME_PLACE = 0.5
@@ -60,6 +72,8 @@ class LostTracks:
         doubtful: (lost,), whether the drone is tracked again, but only at the place where it was lost, without moving
             since. This track may follow a ghost. Such a drone is only assigned to a candidate that departs from there.
         left_m: (places, 3), all places where drones stood still when they were lost. Ghosts may be at these places.
+        region_m: (2, 3), corners of the box about all places where drones were found, metres.
+        new_per_s: rate at which new drones come, as the frames so far show, 1/s; 0 where the drones are counted.
     """
 
     drone: Int[np.ndarray, "lost"]
@@ -69,6 +83,8 @@ class LostTracks:
     size_m: Float[np.ndarray, "lost 3"]
     doubtful: Bool[np.ndarray, "lost"]
     left_m: Float[np.ndarray, "places 3"]
+    region_m: Float[np.ndarray, "2 3"]
+    new_per_s: float
 
 
 def find_false_tracks(
@@ -79,7 +95,8 @@ def find_false_tracks(
     """Find false tracks, which follow ghosts: tracks that never moved, at a place where a moving drone was.
 
     If a drone lands and stays for most of a video, the background model learns it. Before it lands and after it
-    departs, its place is foreground that looks like a drone.
+    departs, its place is foreground that looks like a drone. A drone whose first position is given, and that was found
+    in few frames, is not false: few frames show no standing.
 
     Args:
         position_m: (frames, drones, 3), positions from the first frame of the video.
@@ -88,7 +105,7 @@ def find_false_tracks(
     """
     found_m = np.where(tracked[..., None], position_m, np.nan)
     never_moved, is_false = np.zeros((2, len(size_m)), bool)
-    for drone in np.flatnonzero(tracked.any(axis=0)).tolist():
+    for drone in np.flatnonzero(tracked.sum(axis=0) >= RETURNED_FOUND).tolist():
         never_moved[drone] = _stayed(found_m[tracked[:, drone], drone], size_m[drone])
     for drone in np.flatnonzero(never_moved).tolist():
         reach_m = SAME_PLACE * (size_m + size_m[drone]) / 2
@@ -108,6 +125,8 @@ def find_lost_tracks(
     size_m: Float[np.ndarray, "drones 3"],
     instant: Int[np.ndarray, "frames"],
     fps: float,
+    *,
+    counted: bool = False,
 ) -> LostTracks:
     """Find the drones that are lost in the last frame, or were, and may be found again; false tracks are left out.
 
@@ -119,6 +138,7 @@ def find_lost_tracks(
         size_m: (drones, 3), full lengths along the world's axes.
         instant: (frames,), the frames' instants.
         fps: instants per second.
+        counted: whether it is known how many drones there are, so that what appears is one of them.
     """
     drones, last, places, velocities, doubtful, left = [], [], [], [], [], []
     is_there = np.isfinite(position_m).all(axis=-1)
@@ -143,6 +163,10 @@ def find_lost_tracks(
             velocities.append(velocity_m_s[losses[-1], drone] if standing[-1] is None else np.zeros(3))
             doubtful.append(tracked_now)
     columns = np.array(drones, int)
+    found = tracked & ~is_false
+    # Drones that are found at the beginning did not come: they were there.
+    came = found.any(axis=0) & ~found[:WINDOW_FRAMES].any(axis=0)
+    elapsed_s = (instant[-1] - instant[0] + 1) / fps
     return LostTracks(
         drone=columns,
         position_m=np.array(places).reshape(-1, 3),
@@ -151,7 +175,14 @@ def find_lost_tracks(
         size_m=size_m[columns],
         doubtful=np.array(doubtful, bool),
         left_m=np.array(left).reshape(-1, 3),
+        region_m=_box_m(position_m[found]),
+        new_per_s=0.0 if counted else float((came.sum() + CAME_BEFORE) / elapsed_s),
     )
+
+
+def _box_m(places_m: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "2 3"]:
+    """Corners of the box about some places; inside out where there are none."""
+    return np.stack([places_m.min(axis=0, initial=np.inf), places_m.max(axis=0, initial=-np.inf)])
 
 
 def _standing_place(
@@ -179,7 +210,9 @@ def reidentify(
 
     A drone's velocity is an Ornstein-Uhlenbeck process (see `log_transition`): after a short gap a drone is
     expected on its course, after a long gap anywhere within reach. A drone that stood still most probably stayed. The
-    alternative is a new drone anywhere in the room.
+    alternative is a new drone anywhere in the region where drones are found, of any usual size or as large as those
+    that were lost. The odds against a lost drone are `NEW_ODDS` and the number of new drones that come within its gap.
+    Of several lost drones each is the one that comes back with the same probability.
 
     Args:
         candidates: the candidates.
@@ -192,7 +225,9 @@ def reidentify(
         (candidates,), a row of `lost`, or `NEW`, or `NO_DRONE`. Never new are a candidate that is not sure, one that
         does not move, and a slow one at a place where a drone stood still.
     """
-    count, (low_m, high_m) = len(lost.drone), limits.bounds_m
+    count = len(lost.drone)
+    places_m = np.concatenate([lost.region_m, *(one.position_m[None] for one in candidates)])
+    low_m, high_m = np.clip(_box_m(places_m) + AROUND_M * np.array([[-1.0], [1.0]]), *limits.bounds_m)
     log_volume = float(np.log(np.prod(high_m - low_m)))
     variance = (SPEED_SHARE * limits.max_speed_m_s) ** 2
     is_ghost = [any(_departs_from(other, one) for other in candidates) for one in candidates]
@@ -203,14 +238,13 @@ def reidentify(
     ]
     scores = np.full((len(candidates), count + len(candidates)), _IMPOSSIBLE)
     for row, candidate in enumerate(candidates):
-        log_anywhere = log_normal(candidate.velocity_m_s, variance) - log_volume
-        odds = NEW_ODDS if candidate.moves else NO_DRONE_ODDS
-        log_new = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
+        log_new = log_normal(candidate.velocity_m_s, variance) - log_volume
+        log_new += _log_span_of_new(candidate, lost) + np.log(NEW_ODDS if candidate.moves else NO_DRONE_ODDS)
         scores[row, count + row] = _NEW_NOT_ALLOWED if candidate.moves and max_births == 0 else log_new
         for column in range(0 if is_ghost[row] else count):
             # What may be a ghost is no drone that was lost elsewhere.
             if not is_dying[row] or _may_have_stayed(candidate, lost, column, limits):
-                scores[row, column] = _log_likelihood(candidate, lost, column, log_anywhere, limits)
+                scores[row, column] = _log_likelihood(candidate, lost, column, limits)
     chosen = np.full(len(candidates), NO_DRONE)
     births = 0
     for row, column in zip(
@@ -224,9 +258,15 @@ def reidentify(
     return chosen
 
 
-def _log_likelihood(
-    candidate: TrackCandidate, lost: LostTracks, row: int, log_anywhere: float, limits: FlightLimits
-) -> float:
+def _log_span_of_new(candidate: TrackCandidate, lost: LostTracks) -> float:
+    """Log density of the logarithm of a new drone's span: any usual one, or each of the lost drones' with an error."""
+    spans_m = lost.size_m[np.isfinite(lost.size_m).all(axis=-1)].max(axis=-1)
+    off = np.log(candidate.size_m.max() / spans_m)
+    log_like = [log_normal(each, SPAN_STD**2) for each in off[:, None]]
+    return float(logsumexp([-np.log(np.log(SPANS_M[1] / SPANS_M[0])), *log_like]) - np.log(1 + len(off)))
+
+
+def _log_likelihood(candidate: TrackCandidate, lost: LostTracks, row: int, limits: FlightLimits) -> float:
     """Log likelihood of a lost drone being the candidate: a density over position, velocity and span."""
     place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
     if not np.isfinite(span):
@@ -249,7 +289,11 @@ def _log_likelihood(
         return _UNREACHABLE - distance
     before = np.stack([place, velocity])
     after = np.stack([candidate.position_m, candidate.velocity_m_s])
-    log_flown = max(log_transition(before, after, gap_s, variance, limits.bounds_m), log_anywhere)
+    log_flown = log_transition(before, after, gap_s, variance, limits.bounds_m)
+    num_flying = sum(
+        not doubtful and not _stands(lost, each, limits) for each, doubtful in enumerate(lost.doubtful)
+    )
+    log_flown -= np.log((1 + lost.new_per_s * gap_s / NEW_ODDS) * max(num_flying, 1))
     log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, limits) else 0.0
     return max(log_stayed, log_flown) + log_span
 

@@ -112,7 +112,7 @@ class History:
         spans = np.array([self.span_m(drone) for drone in range(num_drones)]).reshape(-1, 2)
         return spans[:, [0, 0, 1]]
 
-    def lost(self, num_drones: int, frame: int, fps: float) -> LostTracks:
+    def lost(self, num_drones: int, frame: int, fps: float, *, counted: bool) -> LostTracks:
         """The drones that may be found again after a frame; `size_m` is NaN where none of their boxes was seen yet."""
         until = np.s_[: frame + 1, :num_drones]
         return find_lost_tracks(
@@ -122,6 +122,7 @@ class History:
             self.sizes_m(num_drones),
             np.arange(frame + 1),
             fps,
+            counted=counted,
         )
 
     def tracks(self, num_drones: int) -> tuple[Tracks, Places]:

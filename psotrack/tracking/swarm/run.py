@@ -377,6 +377,7 @@ class SwarmRun:
             self._sizes_m()[known],
             instant=flights.instant,
             fps=self._setting.fps,
+            counted=self._settings.drones.count is not None,
         )
 
     def _sizes_m(self) -> Float[np.ndarray, "slots 3"]:
