@@ -135,6 +135,7 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         settings.motion,
         settings.identity,
         fps=recording.fps,
+        bounds_m=run.volume.bounds_m,
         smoothing=smoothing if settings.smooth else None,
     )
     if errors is not None:

@@ -117,6 +117,15 @@ class Trajectories:
         finite = np.isfinite(self.position_m).all(axis=-1)
         return finite if self.status is None else finite & (self.status != Status.LOST)
 
+    def without_lost(self) -> Trajectories:
+        """These trajectories without the positions and velocities of lost drones, and their covariances."""
+        known: dict[str, Any] = {
+            name: np.where(self.seen.reshape(*self.seen.shape, *[1] * len(QUANTITIES[name])), value, np.nan)
+            for name, value in self.quantities().items()
+            if name == "position_m" or name == "velocity_m_s" or name.endswith("covariance_m2")
+        }
+        return replace(self, **known)
+
     def at_frames(self, frame: Int[np.ndarray, "wanted"]) -> Trajectories:
         """Trajectories of chosen frames only.
 

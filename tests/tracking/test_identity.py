@@ -11,8 +11,10 @@ from motion_textbook import DT_S, Model, joint_gaussian
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from psotrack.tracking.identity import LabelOutcome, relabelled, resolve
+from psotrack.settings import IdentitySettings, MotionSettings
+from psotrack.tracking.identity import LabelOutcome, postprocess, relabelled, resolve
 from psotrack.tracking.motion import Measurements
+from psotrack.trajectories import Status, Tracks
 
 ENCOUNTER_M = 0.6
 #: Motion model with a low jerk density, like the flights of the simulator and of these tests.
@@ -21,7 +23,7 @@ GENTLE = Model(density=1.0)
 AGILITY = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LabelledTracks(Measurements):
     """Simulated output of a tracker; `truth`, (frames, drones), is the number of the track that follows each drone."""
 
@@ -321,3 +323,32 @@ class TestAmbiguity:
                 exact = all_histories(model, pulled.part(slice(frames)), 10, 0.2)
                 assert (found.order[frames - 1] == [0, 1]).all()
                 assert found.ambiguity[frames - 1, 0] == pytest.approx(exact[1], abs=limit)
+
+
+@given(st.lists(st.integers(1, 12), min_size=5, max_size=12), st.integers(0, 99))
+@settings(max_examples=20)
+def test_smoothing_states_no_place_for_a_lost_drone_and_none_outside_of_the_room(lengths, seed):
+    """A drone is seen and not seen in turn, and is lost in the fourth frame of a gap; then it is somewhere else."""
+    rng, frame, room_m = (
+        np.random.default_rng(seed),
+        np.arange(60),
+        np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]]),
+    )
+    seen = np.resize(np.repeat(np.arange(len(lengths)) % 2 == 0, lengths), 60)
+    missed = frame - np.maximum.accumulate(np.where(seen, frame, 0))
+    status = np.where(seen, Status.TRACKED, np.where(missed > 3, Status.LOST, Status.COASTING))
+    flight = np.cumsum(np.diff(status == Status.LOST, prepend=False))
+    began = np.searchsorted(flight, flight)
+    place_m, velocity_m_s = rng.uniform(*room_m, (60, 3))[began], rng.normal(0.0, 4.0, (60, 3))[began]
+    # It flies against the walls.
+    place_m = np.clip(place_m + velocity_m_s * (frame - began)[:, None] * DT_S, *room_m)[:, None]
+    spread_m2, number = np.tile(1e-4 * np.eye(3), (60, 1, 1, 1)), np.zeros((60, 1))
+    measured = place_m, place_m, spread_m2, place_m, spread_m2, number, number.astype(int), status[:, None]
+    tracks = Tracks(*measured, np.full((1, 3), 0.3), np.zeros((1, 3), int))
+    how = {"fps": 1 / DT_S, "bounds_m": room_m, "smoothing": MotionSettings()}
+    found, _ = postprocess(tracks, MotionSettings(), IdentitySettings(), **how)
+    np.testing.assert_array_equal(np.isfinite(found.position_m[:, 0]).all(axis=-1), status != Status.LOST)
+    shown_m = found.position_m[found.seen]
+    assert ((shown_m >= room_m[0]) & (shown_m <= room_m[1])).all()
+    # No path leads from one flight to the next, and bends both.
+    assert np.linalg.norm(found.position_m - place_m, axis=-1)[seen].max() < 0.5

@@ -216,7 +216,8 @@ def test_cameras_with_foreground_are_counted_and_too_few_do_not_find_a_drone(cur
 
 
 def trajectories_of(tracks, *, smoothing=None):
-    return postprocess(tracks, SETTINGS.motion, SETTINGS.identity, fps=FPS, smoothing=smoothing)[0]
+    how = {"fps": FPS, "bounds_m": ROOM_M, "smoothing": smoothing}
+    return postprocess(tracks, SETTINGS.motion, SETTINGS.identity, **how)[0]
 
 
 @pytest.mark.slow

@@ -1,4 +1,7 @@
-"""Post-processing: identity swaps are resolved, and on request later frames correct earlier ones (smoothing)."""
+"""Post-processing: identity swaps are resolved, and on request later frames correct earlier ones (smoothing).
+
+A lost drone has no position: its prediction is worth nothing.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,7 @@ def postprocess(
     identity: IdentitySettings,
     *,
     fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
     smoothing: MotionSettings | None,
 ) -> tuple[Trajectories, Identities]:
     """Trajectories with resolved labels, and which drones may have been taken for each other.
@@ -29,6 +33,7 @@ def postprocess(
         motion: settings of the motion model.
         identity: when drones may be taken for each other, and whether swapped labels are put right.
         fps: frames per second.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres, where smoothed tracks end as filtered ones do.
         smoothing: settings of the motion model with which later frames correct earlier ones; None leaves the frames as
             they are.
     """
@@ -55,11 +60,11 @@ def postprocess(
         smoothed = smooth(measured, known)
         trajectories = replace(
             trajectories,
-            position_m=smoothed.position_m,
+            position_m=np.clip(smoothed.position_m, *bounds_m),
             velocity_m_s=smoothed.velocity_m_s,
             covariance_m2=smoothed.covariance_m2,
         )
-    return trajectories, identities
+    return trajectories.without_lost(), identities
 
 
 def _measurements(tracks: Tracks, time_s: Float[np.ndarray, "frames"]) -> Measurements:
@@ -68,4 +73,5 @@ def _measurements(tracks: Tracks, time_s: Float[np.ndarray, "frames"]) -> Measur
         np.asarray(tracks.measured_m, np.float64),
         np.asarray(tracks.measured_covariance_m2, np.float64),
         np.asarray(tracks.status) == Status.TRACKED,
+        np.asarray(tracks.status) == Status.LOST,
     )

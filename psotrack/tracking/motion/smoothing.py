@@ -31,7 +31,7 @@ _JERK_DECADES = np.linspace(-4.0, 6.0, 31)
 _JERK_PRIOR_DECADES = 1.0
 
 #: The values of `Measurements` in a compiled program.
-_Measured = tuple[Array, Array, Array, Array]
+_Measured = tuple[Array, Array, Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,33 @@ class Measurements:
         position_m: (frames, drones, 3), measured positions, world, metres; any value, also NaN, where not measured.
         covariance_m2: (frames, drones, 3, 3), symmetric and positive definite where measured, m².
         was_measured: (frames, drones), True where a drone has a measurement.
+        was_lost: (frames, drones), True where a drone is lost: its next measurement begins it anew, because what was
+            before tells nothing of it; None where none is lost.
     """
 
     time_s: Float[np.ndarray, "frames"]
     position_m: Float[np.ndarray, "frames drones 3"]
     covariance_m2: Float[np.ndarray, "frames drones 3 3"]
     was_measured: Bool[np.ndarray, "frames drones"]
+    was_lost: Bool[np.ndarray, "frames drones"] | None = None
 
     def __getitem__(self, frames: slice | Int[np.ndarray, "rows"]) -> Measurements:
         """The measurements in some frames."""
-        return Measurements(*(value[frames] for value in vars(self).values()))
+        lost = None if self.was_lost is None else self.was_lost[frames]
+        by_frame = self.time_s, self.position_m, self.covariance_m2, self.was_measured
+        return Measurements(*(value[frames] for value in by_frame), was_lost=lost)
+
+    @property
+    def goes_on(self) -> Bool[np.ndarray, "frames drones"]:
+        """(frames, drones), True where a drone was measured before and was not lost since."""
+        row = np.arange(len(self.time_s))[:, None]
+        lost = np.zeros_like(self.was_measured) if self.was_lost is None else self.was_lost
+        measured, lost = (
+            np.maximum.accumulate(np.where(happened, row, -1), axis=0)
+            for happened in (self.was_measured, lost)
+        )
+        # What happened in the frame itself does not count.
+        return np.concatenate([np.zeros_like(measured[:1], bool), (measured > lost)[:-1]])
 
     def check(self) -> None:
         """Check that a filter can use the measurements.
@@ -76,7 +93,7 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Filtered or smoothed tracks, float64; NaN before a drone's first measurement.
+    """Filtered or smoothed tracks, float64; NaN before a drone's first measurement, and where it is lost.
 
     Attributes:
         position_m, velocity_m_s, acceleration_m_s2: (frames, drones, 3), world.
@@ -93,8 +110,8 @@ def smooth(measured: Measurements, params: MotionParams) -> Smoothed:
     """Estimate every frame from all measurements, before and after the frame.
 
     A track begins at its first measurement with velocity 0 and the standard deviation of `params`. Gaps are bridged
-    from both sides, and after the last measurement the drone is predicted. Outliers get less weight, as in
-    `kalman.update`, except for the first measurement, which has no prediction to compare with.
+    from both sides, except where the drone is lost, and after the last measurement the drone is predicted. Outliers
+    get less weight, as in `kalman.update`, except for the first measurement, which has no prediction to compare with.
 
     Raises:
         InputError: as `Measurements.check` says.
@@ -121,9 +138,8 @@ def _estimated(program: Callable, measured: Measurements, params: MotionParams) 
     measured.check()
     with as_written(float64=True):
         states = Smoothed(*map(np.array, program(*_in_float64(measured, params))))
-    not_begun = ~np.logical_or.accumulate(measured.was_measured, axis=0)
     for value in vars(states).values():
-        value[not_begun] = np.nan
+        value[~(measured.was_measured | measured.goes_on)] = np.nan
     return states
 
 
@@ -155,38 +171,43 @@ def estimate_jerk_density(measured: Measurements, params: MotionParams) -> Float
 
 def _in_float64(measured: Measurements, params: MotionParams) -> tuple[_Measured, MotionParams]:
     """Arguments of the compiled programs."""
+    values = (
+        measured.time_s,
+        measured.position_m,
+        measured.covariance_m2,
+        measured.was_measured,
+        measured.goes_on,
+    )
     return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float64),
-        (tuple(vars(measured).values()), params),
+        lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float64), (values, params)
     )
 
 
 def _filtered(measured: _Measured, params: MotionParams) -> tuple[MotionState, MotionState, Array]:
     """Run the filter: predicted states, corrected states, and log likelihoods (frames, drones).
 
-    Before a drone's first measurement its state has no meaning; the log likelihood is 0 up to that measurement.
+    Before a drone's measurements its state has no meaning; the log likelihood of the first of them is 0.
     """
 
     def initial(position: Array, covariance: Array) -> MotionState:
         return kalman.init(position, jnp.zeros_like(position), covariance, params)
 
-    def step(carry: tuple, frame: tuple) -> tuple[tuple, tuple]:
-        state, has_begun = carry
-        dt_s, position, covariance, is_measured = frame
+    def step(state: MotionState, frame: tuple) -> tuple[MotionState, tuple]:
+        dt_s, position, covariance, is_measured, goes_on = frame
         predicted = kalman.predict(state, dt_s, params)
         corrected, _ = kalman.update(predicted, position, covariance, is_measured, params)
         log_density = kalman.log_likelihood(predicted, position, covariance, params)
-        state = kalman.select_drones(has_begun, corrected, initial(position, covariance))
-        log_density = jnp.where(has_begun & is_measured, log_density, 0.0)
-        return (state, has_begun | is_measured), (predicted, state, log_density)
+        state = kalman.select_drones(goes_on, corrected, initial(position, covariance))
+        log_density = jnp.where(goes_on & is_measured, log_density, 0.0)
+        return state, (predicted, state, log_density)
 
     # The scan carries these values along before a drone's first measurement, so they must be finite.
-    time_s, position_m, covariance_m2, was_measured = measured
+    time_s, position_m, covariance_m2, was_measured, goes_on = measured
     position_m = jnp.where(was_measured[..., None], position_m, 0.0)
     covariance_m2 = jnp.where(was_measured[..., None, None], covariance_m2, jnp.eye(3))
-    carry = (initial(position_m[0], covariance_m2[0]), jnp.zeros(was_measured.shape[1], bool))
+    first = initial(position_m[0], covariance_m2[0])
     dt_s = jnp.diff(time_s, prepend=time_s[:1])
-    return jax.lax.scan(step, carry, (dt_s, position_m, covariance_m2, was_measured))[1]
+    return jax.lax.scan(step, first, (dt_s, position_m, covariance_m2, was_measured, goes_on))[1]
 
 
 def _without_error(states: MotionState) -> tuple[Array, ...]:
@@ -211,7 +232,7 @@ def _smoothed(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
     predicted, filtered, _ = _filtered(measured, params)
 
     def step(later: tuple[Array, Array], frame: tuple) -> tuple[tuple[Array, Array], MotionState]:
-        state, next_predicted, dt_s = frame
+        state, next_predicted, dt_s, goes_on = frame
         change, covariance = backward_step(
             state.covariance,
             kalman.apply_transition(jnp.broadcast_to(jnp.eye(12), state.covariance.shape), dt_s, params),
@@ -220,13 +241,18 @@ def _smoothed(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
             later[1],
             (later[0] - next_predicted.mean)[..., None],
         )
-        mean = state.mean + change[..., 0]
+        # Nothing comes back from a frame in which the drone begins anew, or is lost.
+        mean = state.mean + jnp.where(goes_on[:, None], change[..., 0], 0.0)
+        covariance = jnp.where(goes_on[:, None, None], covariance, state.covariance)
         return (mean, covariance), kalman.state_from_mean(mean, covariance, state.noise_m2)
 
     earlier, last = (jax.tree.map(itemgetter(rows), filtered) for rows in (slice(-1), -1))
     next_predicted = jax.tree.map(itemgetter(slice(1, None)), predicted)
     _, smoothed = jax.lax.scan(
-        step, (last.mean, last.covariance), (earlier, next_predicted, jnp.diff(measured[0])), reverse=True
+        step,
+        (last.mean, last.covariance),
+        (earlier, next_predicted, jnp.diff(measured[0]), measured[4][1:]),
+        reverse=True,
     )
     return _without_error(jax.tree.map(lambda part, end: jnp.concatenate([part, end[None]]), smoothed, last))
 

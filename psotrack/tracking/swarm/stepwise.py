@@ -152,10 +152,11 @@ class StepwiseTracker:
         known["covariance_m2"] = known["covariance_m2"] + (
             self._drones.origin_uncertainty_m or 0.0
         ) ** 2 * np.eye(3)
-        return Trajectories(
+        found = Trajectories(
             frame=np.array([instant]),
             time_s=np.array([time_s]),
             drones=tuple(f"{number[slot]}" for slot in slots),
             position_m=np.asarray(rows.position_m)[:, slots] - body_offset_m,
             **known,
         )
+        return found.without_lost()
