@@ -10,6 +10,7 @@ many settings of a sweep at once.
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -50,12 +51,24 @@ from psotrack.pipeline.results import (
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
 from psotrack.support import Report, measured_compiling, no_progress, processors
-from psotrack.tracking.births import MovingPoints, first_drones, given_state, known_motion, start_source
+from psotrack.tracking.births import (
+    MovingPoints,
+    first_drones,
+    given_state,
+    known_motion,
+    start_source,
+    with_speed_of_tracks,
+)
 from psotrack.tracking.camera_errors import views_of_places, with_camera_errors
 from psotrack.tracking.fusion import fuse_tracks
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.swarm import Places, RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status, Tracks
+
+logger = logging.getLogger(__name__)
+
+#: Largest number of times that a recording is tracked again because its drones are faster than was assumed.
+_MOST_SPEEDS = 3
 
 
 def track_recording(
@@ -177,7 +190,7 @@ def _track(
         by_swarm |= _track_by_swarm(together, report)
     results = []
     for run, given in zip(runs, settings, strict=True):
-        result = _result_of(run, by_swarm.get(run), report)
+        run, result = _at_speed_of_tracks(run, _result_of(run, by_swarm.get(run), report), report)
         if given.clocks == "auto" and result.tracks.num_drones:
             clocks = estimate_clocks(run, result.tracks)
             warn_of_unknown_clocks(clocks, run.recording)
@@ -189,6 +202,23 @@ def _track(
             )
         results.append((run, result))
     return results
+
+
+def _at_speed_of_tracks(run: Run, result: MethodResult, report: Report) -> tuple[Run, MethodResult]:
+    """The run and its result; again with a higher speed limit where tracks reach a limit that nobody gave."""
+    for _ in range(_MOST_SPEEDS if run.plugin is None else 0):
+        volume = with_speed_of_tracks(run.volume, result.tracks, run.recording.fps)
+        if volume is run.volume:
+            break
+        logger.warning(
+            "up to %.1f m/s are flown: the assumed limit of %g m/s may cut off %d sightings; tracked again with %g m/s "
+            "(or pass --max-speed)",
+            *(volume.seen_speed_m_s, run.volume.max_speed_m_s, volume.num_faster, volume.max_speed_m_s),
+        )
+        settings = run.settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
+        run = replace(run, settings=settings, volume=volume)
+        result = _result_of(run, _track_by_swarm([run], report).get(run) if run.by_swarm else None, report)
+    return run, result
 
 
 def _result_of(run: Run, swarm: MethodResult | None, report: Report) -> MethodResult:

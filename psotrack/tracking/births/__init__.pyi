@@ -20,7 +20,7 @@ from .initial_state import (
     start_source,
     state_at_first_frame,
 )
-from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_points
+from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_points, with_speed_of_tracks
 from .reidentification import (
     NEW,
     NO_DRONE,
@@ -66,4 +66,5 @@ __all__ = [
     "state_at",
     "state_at_first_frame",
     "unexplained",
+    "with_speed_of_tracks",
 ]

@@ -46,7 +46,8 @@ def find_cut_off(tracks: Tracks, volume: FlightVolume, fps: float) -> str | None
                 (frame, drone, f"was lost at the bound {bound}; if it flies on, pass wider --bounds")
             )
         for (frame,) in np.argwhere(at_limit[:, drone])[:1].tolist():
-            limit = f"{volume.max_speed_m_s:g} m/s; if it is faster, pass a higher --max-speed"
+            times = f"in {at_limit[:, drone].sum()} frames"
+            limit = f"{volume.max_speed_m_s:g} m/s {times}; if it is faster, pass a higher --max-speed"
             cases.append((frame, drone, f"flies at the speed limit of {limit}"))
     if not cases:
         return None

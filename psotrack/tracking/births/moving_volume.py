@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, viewpoints
@@ -18,6 +19,7 @@ from psotrack.settings import USUAL_SPEED_M_S
 from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, FlightLimits, TrackCandidate
 from psotrack.tracking.births.initial_state import room_bounds
 from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
+from psotrack.trajectories import Tracks
 
 #: Number of windows, and frames of a window: enough for a drone to be born before two cameras.
 WINDOWS, WINDOW_FRAMES = 12, 16
@@ -36,6 +38,10 @@ MARGIN, LEAST_MARGIN_M = 0.15, 1.0
 NEAR_BOUND_M = 0.5
 #: The speed limit is this many times the largest speed that is seen.
 SPEED_MARGIN = 1.5
+#: Speeds of tracks are those over the first time, their median over the second, seconds: one jump is not fast.
+SPEED_LAG_S, SPEED_S = 0.1, 0.3
+#: A track that is faster than this share of the limit may be cut off by it.
+AT_LIMIT = 0.95
 #: Share of the points that may be outliers, on each side.
 OUTLIERS = 0.01
 #: A smaller share of the points outside of given bounds is not worth a warning.
@@ -77,10 +83,11 @@ class FlightVolume:
         bounds_m: (2, 3), lowest and highest corner, metres.
         bounds_from: "given", "cameras", or "cameras and moving points", which extend the room of the cameras.
         max_speed_m_s: largest speed of a drone, m/s.
-        speed_from: "given", "default" or "moving points".
+        speed_from: "given", "default", "moving points", or "tracks" that were faster than any of these.
         num_points: number of moving points; None where they were not looked for.
         share_outside: share of the moving points outside of the bounds; 0 where few are.
-        seen_speed_m_s: largest speed of the moving points; 0 where there are none.
+        seen_speed_m_s: largest speed of the moving points, or of the tracks; 0 where there are none.
+        num_faster: number of sightings that a first limit, which the tracks raised, may have cut off.
     """
 
     bounds_m: Float[np.ndarray, "2 3"]
@@ -90,6 +97,7 @@ class FlightVolume:
     num_points: int | None = None
     share_outside: float = 0.0
     seen_speed_m_s: float = 0.0
+    num_faster: int = 0
 
     @property
     def record(self) -> dict[str, Any]:
@@ -136,6 +144,37 @@ def flight_volume(
         num_points=None if points is None else len(points),
         share_outside=outside if outside > FEW_OUTSIDE else 0.0,
         seen_speed_m_s=seen_m_s,
+    )
+
+
+def with_speed_of_tracks(volume: FlightVolume, tracks: Tracks, fps: float) -> FlightVolume:
+    """The volume, with a higher speed limit where tracks reach the one that nobody gave; the same volume elsewhere.
+
+    Moving points are looked for in a part of the frames only, and whoever is fast is there for few of them.
+
+    Args:
+        volume: the volume in which the tracks were made.
+        tracks: tracks of all frames.
+        fps: frames per second.
+    """
+    lag, count = max(1, round(SPEED_LAG_S * fps)), max(3, round(SPEED_S * fps))
+    if volume.speed_from == "given" or tracks.num_frames < lag + count:
+        return volume
+    found_m, variance_m2 = tracks.found_m(), np.trace(tracks.measured_covariance_m2, axis1=-2, axis2=-1)
+    step2_m2 = np.square(found_m[lag:] - found_m[:-lag]).sum(axis=-1) - variance_m2[lag:] - variance_m2[:-lag]
+    windows_m2 = sliding_window_view(step2_m2, count, axis=0)
+    windows_m2 = windows_m2[np.isfinite(windows_m2).mean(axis=-1) > 2 / 3]
+    speed_m_s = np.sqrt(np.maximum(np.nanmedian(windows_m2, axis=-1), 0.0)) * fps / lag
+    seen_m_s = float(np.quantile(speed_m_s, 1 - OUTLIERS)) if len(speed_m_s) else 0.0
+    least_m_s = AT_LIMIT * volume.max_speed_m_s
+    if seen_m_s < least_m_s:
+        return volume
+    return replace(
+        volume,
+        max_speed_m_s=round(SPEED_MARGIN * seen_m_s, 1),
+        speed_from="tracks",
+        seen_speed_m_s=seen_m_s,
+        num_faster=volume.num_faster + int((speed_m_s >= least_m_s).sum()),
     )
 
 
