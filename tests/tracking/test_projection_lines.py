@@ -159,15 +159,15 @@ def test_a_given_drone_that_is_seen_late_keeps_its_number():
 @pytest.mark.slow
 @pytest.mark.parametrize("same_way", [False, True])
 def test_bodies_that_pass_one_after_the_other_are_as_many_tracks(same_way):
-    """Fourteen bodies cross the view of three cameras at 4 to 12 m/s, one to two seconds after the last one left."""
+    """Fourteen bodies cross the view of three cameras at 4 to 12 m/s, one to three seconds after the last one."""
     rng, num = np.random.default_rng(0), 14
     rig = make_unnamed_rig(*(camera_at((x_m, -6.0, 2.0), (0.0, 0.0, 1.5)) for x_m in (-4.0, 0.0, 4.0)))
     speed_m_s, angle = rng.uniform(4.0, 12.0, num), rng.uniform(0, 2 * np.pi, num)
     ahead = np.stack([np.cos(angle), np.sin(angle), 0.1 * rng.normal(size=num)], axis=-1)
     ahead = np.array([1.0, 0.1, 0.0]) if same_way else ahead
     middle_m = np.array([0.0, 0.0, 1.5]) + 0.5 * rng.normal(size=(num, 3))
-    half_s = 4.0 / speed_m_s
-    middle_s = np.cumsum(2 * half_s + rng.uniform(1.0, 2.0, num))
+    half_s = 6.0 / speed_m_s
+    middle_s = np.cumsum(2 * half_s + rng.uniform(1.0, 3.0, num))
     from_middle_s = np.arange(round(middle_s[-1] * FPS) + 50)[:, None] / FPS - middle_s
     truth_m = middle_m + from_middle_s[..., None] * speed_m_s[:, None] * ahead
     truth_m[abs(from_middle_s) > half_s] = np.nan

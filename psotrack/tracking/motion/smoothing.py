@@ -58,8 +58,8 @@ class Measurements:
     def __getitem__(self, frames: slice | Int[np.ndarray, "rows"]) -> Measurements:
         """The measurements in some frames."""
         lost = None if self.was_lost is None else self.was_lost[frames]
-        by_frame = self.time_s, self.position_m, self.covariance_m2, self.was_measured
-        return Measurements(*(value[frames] for value in by_frame), was_lost=lost)
+        place_m, spread_m2 = self.position_m[frames], self.covariance_m2[frames]
+        return Measurements(self.time_s[frames], place_m, spread_m2, self.was_measured[frames], lost)
 
     @property
     def goes_on(self) -> Bool[np.ndarray, "frames drones"]:
