@@ -276,8 +276,6 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
             report=report,
         )
     seconds["track"] += run.read_s
-    if not run.by_swarm:
-        warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
     return _with_camera_errors(run, result, places)
 
