@@ -353,7 +353,8 @@ def _lost_frames(
         )
         # Of two cameras, that which is later afterwards has lost frames.
         jump_s = step[0][:, 1] - np.sort(step[0][:, 1])[(len(rig) - 1) // 2]
-        certainty = jump_s / np.sqrt(np.diag(step[1])[1::2])
+        std_of_jump_s = np.sqrt(np.diag(step[1])[1::2])
+        certainty = np.divide(jump_s, std_of_jump_s, out=np.zeros(len(rig)), where=std_of_jump_s > 0)
         camera = int(certainty.argmax())
         if step[2] < line[2] and certainty[camera] > _CLEARLY and (best is None or step[2] < best[0]):
             best = step[2], camera, step[0][:, 0], jump_s
