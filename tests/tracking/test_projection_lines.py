@@ -232,6 +232,20 @@ def test_a_part_of_a_drone_that_two_cameras_see_once_is_no_second_drone(seed, be
     assert (tracked.status == Status.TRACKED).all()
 
 
+@pytest.mark.parametrize(
+    ("cameras_of_each", "count"), [((slice(4), slice(4, 8)), 1), ((slice(5), slice(3, 8)), 2)]
+)
+def test_a_drone_that_half_of_the_cameras_see_elsewhere_is_no_second_one(cameras_of_each, count):
+    """Cameras that were turned agree on a place 0.6 m beside the drone; of two drones some camera sees both."""
+    truth_m = circles(1) + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6]])
+    unseen = np.ones((FRAMES, 8, 2), bool)
+    for drone, cameras in enumerate(cameras_of_each):
+        unseen[:, cameras, drone] = False
+    # The first drone has a track before the second one appears.
+    unseen[:12, :, 1] = True
+    assert seen_and_tracked(truth_m, jitter=0.02, unseen=[unseen]).num_drones == count
+
+
 def test_chance_crossings_of_two_cameras_take_no_detection_from_a_drone():
     """Each camera misses a fifth of the drones and has three false alarms: lines of two cameras cross everywhere."""
     truth_m = circles(6, frames=25)

@@ -95,11 +95,13 @@ class KnownDrones:
         size_m: (drones, 3), full lengths along the world's axes, metres; NaN where they are not known yet.
         box_px: (drones, cameras, 4), middle and half lengths of their boxes; NaN where there is none; None where
             nothing is known of what they hide.
+        seen: (drones, cameras), cameras whose sightings are the drones'; None where that is not known.
     """
 
     position_m: Float[np.ndarray, "drones 3"]
     size_m: Float[np.ndarray, "drones 3"]
     box_px: Float[np.ndarray, "drones cameras 4"] | None = None
+    seen: Bool[np.ndarray, "drones cameras"] | None = None
 
 
 #: No drone is known.
@@ -430,7 +432,19 @@ class Births:
             & ((self._num_viewpoints(whole) >= 2) | (len(spans_m) == 0))
             & ((crossed.ambiguity < AMBIGUOUS) | (crossed.num_viewpoints >= TRUSTED_VIEWPOINTS))
             & ~((crossed.expected < 0) & better.any(axis=1))
+            & ~self._seen_instead(crossed, known)
         )
+
+    def _seen_instead(self, crossed: Crossings, known: KnownDrones) -> Bool[np.ndarray, "crossings"]:
+        """Which crossings are of cameras that all should see some known drone, and of which none does.
+
+        Where cameras disagree, some of them see a drone beside the place where the others see it: no second drone.
+        """
+        if known.seen is None or not len(known.seen):
+            return np.zeros(len(crossed.seen), bool)
+        should_see = in_images(self._cameras, known.position_m)
+        all_should = (~crossed.seen[:, None] | should_see).all(axis=-1)
+        return (all_should & ~(crossed.seen[:, None] & known.seen).any(axis=-1)).any(axis=-1)
 
     def _distances_m(self, one: Measurement) -> Float[np.ndarray, "paths"]:
         return np.linalg.norm(self._mean[: len(self._paths), :3] - one.position_m, axis=-1)

@@ -184,7 +184,11 @@ class _Tracker:
         found = np.isin(numbers, [*measured])[:, None]
         # The corner of the image is the origin of the boxes of known drones.
         known_px = np.where(found[..., None], expected_px + np.array([0.5, 0.5, 0.0, 0.0]), np.nan)
-        known = KnownDrones(np.where(found, expected.position_m, np.nan), span_m[:, [0, 0, 1]], known_px)
+        seen = np.zeros((len(numbers), len(self._density_px2)), bool)
+        for row, number in enumerate(numbers):
+            seen[row] = number in measured and np.isfinite(measured[number].noise_px)
+        known_m = np.where(found, expected.position_m, np.nan)
+        known = KnownDrones(known_m, span_m[:, [0, 0, 1]], known_px, seen)
         # As the cameras showed them: what is born has a motion of its own. Parts of split boxes are of known drones.
         num_boxes = shown.noise_px.shape[1]
         unexplained = shown.where(np.isfinite(rest.noise_px[:, :num_boxes]))
