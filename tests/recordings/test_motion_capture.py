@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from real_data import published
 from scipy.spatial.transform import Rotation
 
+from psotrack.recordings.exchange import read_tracks
 from psotrack.recordings.mocap import Markers, marker_bodies, read_c3d, write_c3d
 from psotrack.recordings.mocap.marker_cross_poses import correct_labels, cross_poses, identify_markers
 from psotrack.recordings.mocap.marker_crosses import fit_rigid, learn_cross
@@ -73,7 +74,9 @@ def parameters(processor: int, values: dict[str, object]) -> bytes:
     return (start + section).ljust(512 * blocks, b"\0")
 
 
-def make_c3d(path, points, *, processor=INTEL, scale=-0.1, header_frames=None, analog=0, **changed) -> Path:
+def make_c3d(
+    path, points, *, processor=INTEL, scale=-0.1, header_frames=None, first=1, analog=0, **changed
+) -> Path:
     """Write a C3D file of (frames, points, 4), of which the last value is the residual.
 
     Keywords change parameters of POINT, or of a group in GROUP__NAME; None leaves one out.
@@ -96,7 +99,7 @@ def make_c3d(path, points, *, processor=INTEL, scale=-0.1, header_frames=None, a
     section = parameters(processor, {key: value for key, value in values.items() if value is not None})
     count = num_frames if header_frames is None else header_frames
     header = bytes([2, 80])
-    header += struct.pack(order + "5H", num_points, analog, 1, count % 2**16, 0)
+    header += struct.pack(order + "5H", num_points, analog, first, (first + count - 1) % 2**16, 0)
     header += reals([scale], processor)
     header += struct.pack(order + "2H", 2 + len(section) // 512, min(analog, 1))
     header += reals([50.0], processor)
@@ -138,13 +141,21 @@ def test_byte_orders_integers_and_reals(tmp_path, processor, scale, analog, capl
         np.testing.assert_allclose(markers.position_m[seen], independent[seen] / 1e3, rtol=1e-12)
 
 
+PROMISED = {"FRAMES": 1149}
 LONG = {"FRAMES": 65535, "LONG_FRAMES": 20.0}
 FIELDS = {"FRAMES": None, "TRIAL__ACTUAL_START_FIELD": (5, 0), "TRIAL__ACTUAL_END_FIELD": (24, 0)}
 
 
 @pytest.mark.parametrize(
     ("header_frames", "changed", "expected"),
-    [(1149, {}, 20), (20, {"FRAMES": 12}, 12), (9, {"FRAMES": 0}, 9), (9, LONG, 20), (9, FIELDS, 20)],
+    [
+        (1149, {}, 20),
+        (1149, {"FRAMES": 1149}, 20),
+        (20, {"FRAMES": 12}, 12),
+        (9, {"FRAMES": 0}, 9),
+        (9, LONG, 20),
+        (9, FIELDS, 20),
+    ],
 )
 def test_frames_by_what_the_parameters_say_and_what_is_there(
     tmp_path, caplog, header_frames, changed, expected
@@ -594,14 +605,32 @@ def test_what_is_no_motion_capture_is_refused(tmp_path, words):
     assert_refused(lambda: read_c3d(path), "a.c3d: expected", words, unchanged=tmp_path)
 
 
-def test_a_file_that_is_cut_short_is_refused(tmp_path):
-    """ezc3d reads it without an error."""
-    path = make_c3d(tmp_path / "a.c3d", np.ones((400, 3, 4)))
+def test_of_a_file_that_is_cut_short_the_whole_frames_are_read(tmp_path, caplog):
+    """As ezc3d does, but with a warning."""
+    points = np.random.default_rng(0).uniform(1, 2, (400, 3, 4))
+    path = make_c3d(tmp_path / "a.c3d", points)
     content = path.read_bytes()
+    # A frame has 48 bytes.
     path.write_bytes(content[:-1000])
-    assert_refused(lambda: read_c3d(path), "400 frames as its parameters say", unchanged=tmp_path)
+    np.testing.assert_allclose(read_c3d(path).position_m, points[:379, :, :3] / 1e3, rtol=1e-6)
+    assert "it holds 379, of which 379 are read; was it cut short?" in caplog.text
     path.write_bytes(content[:1000])
     assert_refused(lambda: read_c3d(path), "cut short in its parameters: copy it again", unchanged=tmp_path)
+
+
+@pytest.mark.parametrize("fields", [{}, {"TRIAL__ACTUAL_START_FIELD": (51, 0), "first": 1}])
+def test_a_file_whose_first_frames_were_cut_off_keeps_its_times(tmp_path, caplog, fields):
+    """Found: a reference that was half a second early, in silence."""
+    points = np.dstack([1e3 * record_markers(FOUR_M, 120), np.zeros((120, 4))])
+    labels = {"LABELS": ("Dron1:1", "Dron1:2", "Dron1:3", "Dron1:4")}
+    whole = marker_bodies(read_c3d(make_c3d(tmp_path / "a.c3d", points, **labels)), WHERE)
+    assert not caplog.records
+    path = make_c3d(tmp_path / "b.c3d", points[50:], **({"first": 51} | labels | fields))
+    late = marker_bodies(read_c3d(path), WHERE)
+    assert "b.c3d: its first frame has the number 51, and so the time 1.000 s; if the videos" in caplog.text
+    np.testing.assert_array_equal(late.time_s, whole.time_s[50:])
+    np.testing.assert_allclose(late.position_m, whole.position_m[50:], atol=1e-6)
+    assert read_tracks(path).time_s[0] == 1
 
 
 def test_more_frames_than_a_file_holds_are_refused(tmp_path):

@@ -48,11 +48,10 @@ def read_c3d_tracks(path: Path, recording: Recording | None) -> Trajectories:
     labels = [label for label in markers.labels if markers.labels.count(label) > 1]
     if labels:
         raise InputError(path, expected="points with different labels", found=f"{labels[0]} twice")
-    frame = np.arange(len(markers.position_m))
+    frame = markers.frame
     read = Trajectories(frame, frame / markers.rate_hz, markers.labels, markers.position_m)
     if recording is None or abs(markers.rate_hz / recording.fps - 1) > _ONE_RATE:
         return read
     time_s = recording.timeline().time_s
-    known = frame < len(time_s)
-    read = read.at_frames(frame[known])
-    return replace(read, time_s=time_s[: int(known.sum())].astype(np.float64))
+    read = read.at_frames(frame[frame < len(time_s)])
+    return replace(read, time_s=time_s[read.frame].astype(np.float64))

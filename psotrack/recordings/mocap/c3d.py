@@ -14,7 +14,7 @@ from pathlib import Path
 
 import ezc3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.mocap.c3d_format import BLOCK_BYTES, Header, Parameters, Processor, read_layout
@@ -45,13 +45,20 @@ class Markers:
         labels: one label per marker; `Dron4:Dron41` is a marker of the body `Dron4`, `*12` is an unidentified marker.
         position_m: (frames, markers, 3), positions in the world, metres; NaN if the marker was not seen.
         rate_hz: frames per second.
+        first_frame: number of the first frame, from 0 on; above 0 where the recording's first frames were cut off.
     """
 
     labels: tuple[str, ...]
     position_m: Float[np.ndarray, "frames markers 3"]
     rate_hz: float
+    first_frame: int = 0
 
     __repr__ = short_repr
+
+    @property
+    def frame(self) -> Int[np.ndarray, "frames"]:
+        """(frames,), numbers of the frames."""
+        return self.first_frame + np.arange(len(self.position_m))
 
     def __post_init__(self) -> None:
         if self.position_m.shape[1:] != (len(self.labels), 3):
@@ -66,12 +73,13 @@ def read_c3d(path: Path | str) -> Markers:
     """Read the markers of a C3D file of any maker, in metres.
 
     The parameters of the file count, not its header: some makers leave the header at what it was before the recording
-    was cut. Where there are no parameters, the header counts, and markers have no labels. A length unit that is not
-    stated is the millimetre, with a warning.
+    was cut. Where there are no parameters, the header counts, and markers have no labels. A warning says that a length
+    unit is not stated and taken for the millimetre, that a file has fewer frames than it promises, and at what time it
+    begins where its first frames were cut off.
 
     Raises:
-        InputError: the file cannot be read, is cut short, has no markers, has a position far away from everything that
-            motion capture can see, or its length unit is unknown.
+        InputError: the file cannot be read, is cut short before its first frame, has no markers, has a position far
+            away from everything that motion capture can see, or its length unit is unknown.
     """
     path = Path(path)
     try:
@@ -96,7 +104,14 @@ def read_c3d(path: Path | str) -> Markers:
         raise InputError(path, expected=f"positions of at most {_FARTHEST_M:g} m", found=found)
     rate_hz = parameters.number("POINT:RATE") or header.rate_hz
     check_rate(path, rate_hz)
-    return Markers(_labels(parameters, data.num_points), position_m, rate_hz)
+    first = _long_number(parameters, "TRIAL:ACTUAL_START_FIELD") or header.first_frame
+    if first > 1:
+        begin_s = (first - 1) / rate_hz
+        _logger.warning(
+            "%s: its first frame has the number %d, and so the time %.3f s; if the videos begin with it, say "
+            "[reference] time_offset_s = %.3f", path, first, begin_s, -begin_s,
+        )  # fmt: skip
+    return Markers(_labels(parameters, data.num_points), position_m, rate_hz, max(first - 1, 0))
 
 
 def write_c3d(path: Path | str, markers: Markers) -> None:
@@ -265,10 +280,10 @@ def _long_number(parameters: Parameters, name: str) -> int | None:
 
 
 def _count_frames(path: Path, header: Header, stated: int | None, available: int, frame_bytes: int) -> int:
-    """Number of frames to read: what the parameters state where it is there, else what the header states.
+    """Number of frames to read: what the parameters state where it is there, else what the header states, or all.
 
     Raises:
-        InputError: fewer frames are there than the parameters and the header state.
+        InputError: no whole frame is there.
     """
     if not available:
         raise InputError(
@@ -281,19 +296,12 @@ def _count_frames(path: Path, header: Header, stated: int | None, available: int
         stated = header.num_frames if header.num_frames and not overflown else available
     count = stated
     if available < stated:
-        count = header.num_frames
-        if not 0 < count <= available:
-            raise InputError(
-                path,
-                expected=f"{stated} frames as its parameters say",
-                found=f"{available}",
-                remedy="the file is cut short: copy it again",
-            )
+        count = header.num_frames if 0 < header.num_frames <= available else available
     # The header's 16 bits cannot count more frames.
-    if header.num_frames != stated and stated < _MAX_FRAMES:
+    if count < stated or (header.num_frames != stated and stated < _MAX_FRAMES):
         _logger.warning(
-            "%s: its header says %d frames and its parameters say %d; it holds %d, of which %d are read",
-            path, header.num_frames, stated, available, count,
+            "%s: its header says %d frames and its parameters say %d; it holds %d, of which %d are read%s",
+            path, header.num_frames, stated, available, count, "; was it cut short?" * (count < stated),
         )  # fmt: skip
     return count
 

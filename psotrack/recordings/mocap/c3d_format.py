@@ -57,6 +57,7 @@ class Header:
     Attributes:
         num_points: points per frame.
         num_analog: analogue samples per frame of points.
+        first_frame: number of the first frame, from 1 on; above 1 where frames were cut off.
         num_frames: number of frames.
         scale: length units per unit of an integer coordinate; below 0 if coordinates are reals.
         data_block: number of the first block of frames, 1 for the block of the header.
@@ -66,6 +67,7 @@ class Header:
 
     num_points: int
     num_analog: int
+    first_frame: int
     num_frames: int
     scale: float
     data_block: int
@@ -134,6 +136,7 @@ def _read_header(content: bytes, processor: Processor) -> Header:
     return Header(
         num_points=num_points,
         num_analog=num_analog,
+        first_frame=first,
         num_frames=max(0, last - first + 1),
         scale=float(processor.reals(content[12:16])[0]),
         data_block=data_block,

@@ -46,12 +46,11 @@ def marker_bodies(
     position_m, orientation_wxyz, bridged = (np.stack(each, axis=1) for each in zip(*poses, strict=True))
     if np.isnan(position_m).all():
         raise InputError(where, expected="three markers of a drone in some frame", found="none")
-    frame = np.arange(len(position_m))
     turned = not np.isnan(orientation_wxyz).all()
     status = np.where(bridged, Status.COASTING, Status.TRACKED)
     return Trajectories(
-        frame,
-        frame / markers.rate_hz,
+        markers.frame,
+        markers.frame / markers.rate_hz,
         tuple(bodies),
         position_m,
         orientation_wxyz=orientation_wxyz if turned else None,
