@@ -41,8 +41,8 @@ def _metavar(values: str) -> Meta:
     return Meta(extra={"metavar": values})
 
 
-#: The seeds of JAX and NumPy.
-Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+#: The seeds that JAX tells apart: of longer ones it takes the last 32 bits.
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 
 
 class _Checked(msgspec.StructMeta):

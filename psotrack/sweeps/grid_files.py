@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, errors_name
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings, flatten, setting_names
 from psotrack.support import assign, convert, nearest, read_toml
@@ -191,6 +191,8 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
     if isinstance(data.get("sequences"), list | tuple):
         data["sequences"] = [os.fspath(one) if isinstance(one, Path) else one for one in data["sequences"]]
     file: _File = convert(data, _File, lambda field, *said: _unplaced(f"{where}: {field}", *said))
+    with errors_name(f"{where}: first_seed, last run"):
+        TrackSettings(seed=file.first_seed + file.runs - 1)
     settings = _table(where, "settings", file.settings, SETTINGS)
     methods = {
         name: _table(where, f"methods.{name}", content, SETTINGS) for name, content in file.methods.items()

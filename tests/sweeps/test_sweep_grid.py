@@ -134,6 +134,9 @@ BAD = {
         "settings.swarm.spread_m: expected the name once, found the name twice",
     ),
     # Kinds of values, and values that are out of range.
+    "runs = 2\nfirst_seed = 4294967295": (
+        "first_seed, last run, seed: expected a whole number of at most 4294967295, found 4294967296",
+    ),
     "runs = 0": ("runs: expected a whole number of at least 1, found 0",),
     "grid.swarm.particles = [20, 1]": (
         "grid.swarm.particles[1]: expected a whole number of at least 2, found 1",
