@@ -18,12 +18,13 @@ import heapq
 import io
 import json
 import re
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -40,6 +41,8 @@ from psotrack.trajectories import Trajectories
 WORLD, METADATA = "world", "psotrack"
 _JPEG_QUALITY = 90
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+#: Bytes of the record at a file's end, with the mark after it.
+_FOOTER_BYTES = 37
 #: Types of messages whose poses are read.
 _READ = (ros.POSE, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 #: Time in nanoseconds, topic, type and content of a message.
@@ -120,10 +123,11 @@ def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
     try:
         # The library also prints what it finds in a damaged file.
         with path.open("rb") as stream, contextlib.redirect_stderr(io.StringIO()):
-            reader = make_reader(stream, decoder_factories=[decoder])
+            reader = make_reader(stream, validate_crcs=True, decoder_factories=[decoder])
             summary = reader.get_summary()
             if summary is None:
                 raise EOFError("no summary at its end")
+            _check_summary(stream)
             for record in reader.iter_metadata():
                 if record.name == METADATA:
                     names = json.loads(record.metadata["drones"])
@@ -146,6 +150,17 @@ def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
         for topic, each in rows.items()
     ]
     return joined(path, paths, recording)
+
+
+def _check_summary(stream: BinaryIO) -> None:
+    """Raise `ValueError` for a summary with another checksum than its own; the library checks those of chunks alone."""
+    stream.seek(-_FOOTER_BYTES, io.SEEK_END)
+    footer = stream.read(_FOOTER_BYTES)
+    stream.seek(int.from_bytes(footer[9:17], "little"))
+    # The checksum itself and the eight bytes after it do not count.
+    summary, stated = stream.read()[:-12], int.from_bytes(footer[-12:-8], "little")
+    if stated and zlib.crc32(summary) != stated:
+        raise ValueError("another checksum of the summary than the file says")
 
 
 def _row(message: Any) -> _Row:
