@@ -76,12 +76,12 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     - `inside_90_rate`, `mean_nees`, where the estimate has covariances: see `consistency.consistency`.
 
     Args:
-        traj_est: the estimate; its times are not used.
+        traj_est: the estimate, in the reference's frames.
         traj_ref: the reference.
 
     Raises:
-        InputError: the reference has no known position, both have no frame in common, or a covariance of the estimate
-            is not positive definite.
+        InputError: the reference has no known position, both have no frame in common or frames of other times, or a
+            covariance of the estimate is not positive definite.
     """
     pair = align(traj_est, traj_ref)
     known = pair.truth_known

@@ -68,7 +68,8 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
     reference. In reference frames that the estimate does not have, all drones count as missed.
 
     Raises:
-        InputError: the reference has no known position, or estimate and reference have no frame in common.
+        InputError: the reference has no known position, estimate and reference have no frame in common, or a frame has
+            another time in the estimate than in the reference.
     """
     known = traj_ref.seen
     rows, columns = known.any(axis=1), known.any(axis=0)
@@ -82,6 +83,15 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
             expected=f"frames of the reference, which knows positions from frame {frame[0]} to {frame[-1]}",
             found=_span(traj_est.frame),
             remedy="check that both belong to the same sequence",
+        )
+    apart_s = np.abs(traj_est.time_s[source] - traj_ref.time_s[rows][to])
+    if len(traj_ref.time_s) > 1 and apart_s.max() > np.median(np.diff(traj_ref.time_s)) / 2:
+        worst = int(np.argmax(apart_s))
+        raise InputError(
+            "estimate",
+            expected=f"frame {frame[to[worst]]} at {traj_ref.time_s[rows][to[worst]]:.6g} s, as in the reference",
+            found=f"{traj_est.time_s[source[worst]]:.6g} s",
+            remedy="read_tracks(path, recording=...) finds the frames by the times",
         )
     kept = np.ix_(rows, columns)
     ref_m = np.where(known[kept][..., None], traj_ref.position_m[kept].astype(np.float64), np.nan)

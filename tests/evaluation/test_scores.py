@@ -236,6 +236,10 @@ BAD = {
         ("expected frames of the reference", "0 to 4, found frames 7 to 8"),
     ),
     "no frame": ((on_x_axis([]), TRUTH), ("found no frames",)),
+    "frames of other times": (
+        (replace(TRUTH, time_s=TRUTH.time_s + 1 / FPS), TRUTH),
+        ("estimate: expected frame 0 at 0 s, as in the reference, found 0.5 s; read_tracks(",),
+    ),
     "no reference": ((TRUTH, on_x_axis([None] * 5)), ("reference: expected a known position",)),
     "no variance": (
         (with_covariance(TRUTH, np.diag([0.01, 0.01, 0.0])), TRUTH),

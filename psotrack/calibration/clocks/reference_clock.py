@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
 from psotrack.evaluation import Offset, find_offset
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, Timeline
 from psotrack.trajectories import UNASSIGNED, Trajectories, resample
 
 #: Largest offset that is tried where nobody says one, seconds.
 USUAL_OFFSET_S = 2.0
-#: Tracks whose rate differs by less than this share from the recording's have the recording's rate.
-_RATE_TOLERANCE = 1e-3
+#: Fewest rows of tracks whose regular frames show a rate below the recording's: by chance, two or three are regular.
+_LEAST_ROWS = 5
 
 
 @dataclass(frozen=True)
@@ -112,17 +113,35 @@ def reference_for(
     truth = recording.truth
     if truth is None:
         raise InputError(recording.name, expected="a reference to compare with", found="none")
-    rate_hz = float(np.ptp(tracks.frame) / max(np.ptp(tracks.time_s), 1e-9))
-    if tracks.num_frames > 1 and abs(rate_hz / recording.fps - 1) >= _RATE_TOLERANCE:
-        recording = replace(recording, timing=replace(recording.timing, rate_hz=rate_hz))
-        time_s = recording.timeline().time_s
-        truth = resample(truth, np.arange(len(time_s)), time_s)
+    timeline = recording.timeline()
+    own = _own_frames(timeline, tracks)
     if offset_s is None:
-        return truth, 0.0
+        return truth if own is None else resample(truth, *own), 0.0
     if offset_s == "auto":
         offset_s = reference_offset(recording, tracks).offset.offset_s
-    time_s = recording.timeline().time_s
-    return resample(own_reference(recording), np.arange(len(time_s)), time_s, later_s=offset_s), offset_s
+    frame, time_s = own or (np.arange(timeline.num_instants), timeline.time_s)
+    return resample(own_reference(recording), frame, time_s, later_s=offset_s), offset_s
+
+
+def _own_frames(
+    timeline: Timeline, tracks: Trajectories
+) -> tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames"]] | None:
+    """Numbers and times of the frames of tracks with a rate of their own; None where it is the recording's."""
+    # Some formats have rows in which nothing is seen, and others leave them out.
+    seen = tracks.seen.any(axis=1)
+    frame, time_s = tracks.frame[seen], tracks.time_s[seen]
+    if len(frame) < 2:
+        return None
+    steps = np.diff(frame)
+    step = int(np.median(steps))
+    is_slow = step > 1 and len(frame) >= _LEAST_ROWS and not (steps % step).any()
+    if not is_slow and timeline.has(frame, time_s):
+        return None
+    interval_s = float(np.ptp(time_s) / np.ptp(frame))
+    first_s = time_s[0] - frame[0] * interval_s
+    last = int((timeline.time_s[-1] - first_s) / interval_s + 1e-6)
+    number = np.arange(frame[0] % step, last + 1, step) if is_slow else np.arange(last + 1)
+    return number, first_s + number * interval_s
 
 
 def own_reference(recording: Recording) -> Trajectories:

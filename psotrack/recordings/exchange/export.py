@@ -11,7 +11,7 @@ import numpy as np
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.recordings.exchange.formats import FORMATS, NAMES, PHRASES, STATUS, TIMES, TrackFormat
-from psotrack.recordings.exchange.timed_paths import interval_s
+from psotrack.recordings.exchange.timed_paths import interval_s, own_interval_s
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 from psotrack.trajectories import Status, Trajectories
 
@@ -55,6 +55,9 @@ def export_tracks(
     _check_name(out, to, len(kept), footage)
     _check_replaceable(out, to, force)
     lost = _lost_quantities(trajectories, form)
+    if TIMES in lost and (own_s := own_interval_s([trajectories])):
+        trajectories = replace(trajectories, frame=np.round(trajectories.time_s / own_s).astype(np.int64))
+        lost = _lost_quantities(trajectories, form)
     if not form.needs_all:
         if not len(kept):
             raise InputError("tracks", expected="a drone that is seen in some frame", found="none")

@@ -14,7 +14,7 @@ from psotrack.recordings.exchange.json_files import read_json_tracks, write_json
 from psotrack.recordings.exchange.kitti_files import POSES, read_kitti, write_kitti
 from psotrack.recordings.exchange.mcap_files import read_mcap, write_mcap
 from psotrack.recordings.exchange.mot_files import TRACKS, WORLD, read_mot_positions, write_mot
-from psotrack.recordings.exchange.timed_paths import joined, timed_path
+from psotrack.recordings.exchange.timed_paths import joined, on_clock, timed_path
 from psotrack.support import Report, are_numbers, first_line, number_words
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 from psotrack.trajectories.tum import read_tum, tum_text, write_tum
@@ -90,9 +90,9 @@ def read_tracks(path: Path | str, *, recording: Recording | None = None) -> Traj
     """Read tracks of psotrack or of another program, from a file or a folder.
 
     CSV and Parquet (see `read_trajectories`), JSON, TUM, KITTI, MOT 3D, C3D and MCAP are recognised by ending and
-    content. Poses that have times only get the frame numbers of the recording's instants, if all their times are
-    instants; a rate of their own, if all times are multiples of an interval; else they are interpolated at the
-    instants, never across a missing sample.
+    content. Times decide: tracks get the frame numbers of the recording's instants, if all their times are instants; a
+    rate of their own, if all times are multiples of an interval; else they are interpolated at the instants, never
+    across a missing sample. A warning says where frame numbers in the file say something else.
 
     Args:
         path: file or folder.
@@ -144,7 +144,8 @@ def _read_tum(where: Path, files: Sequence[Path], recording: Recording | None) -
 
 
 def _read_table(path: Path, recording: Recording | None) -> Trajectories:
-    return read_trajectories(path, fps=None if recording is None else recording.fps)
+    read = read_trajectories(path, fps=None if recording is None else recording.fps)
+    return on_clock(path, read, recording)
 
 
 def _read_csv(path: Path, recording: Recording | None) -> Trajectories:
@@ -173,7 +174,7 @@ def _read_text(path: Path, recording: Recording | None) -> Trajectories:
 _READERS: dict[str, Read] = {
     ".csv": _read_csv,
     ".parquet": _read_table,
-    ".json": read_json_tracks,
+    ".json": lambda path, recording: on_clock(path, read_json_tracks(path), recording),
     ".tum": lambda path, recording: _read_tum(path, [path], recording),
     ".txt": _read_text,
     ".c3d": read_c3d_tracks,

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.support import Report, read_json
 from psotrack.trajectories import QUANTITIES, Status, Trajectories, check_cells
@@ -42,7 +41,7 @@ def write_json_tracks(
     return []
 
 
-def read_json_tracks(path: Path, recording: Recording | None) -> Trajectories:
+def read_json_tracks(path: Path) -> Trajectories:
     """Read trajectories from JSON.
 
     Raises:

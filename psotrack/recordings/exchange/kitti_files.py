@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage
-from psotrack.recordings.exchange.timed_paths import instants_s, timed_path
+from psotrack.recordings.exchange.timed_paths import timed_path
 from psotrack.support import Report, check_file_name, first_repeat, first_true, read_numbers
 from psotrack.trajectories import Trajectories
 
@@ -88,14 +88,14 @@ def _times(file: Path, count: int, recording: Recording | None) -> Float[np.ndar
                 row, expected="times that increase from line to line", found=f"{time_s[row]:g} s"
             )
         return time_s
-    instant_s = instants_s(recording)
-    if instant_s is None:
+    if recording is None:
         raise InputError(
             file,
             expected=f"a file of times, {SEQUENCES}/{file.stem}/{TIMES}",
             found="none",
             remedy="name SEQ, too",
         )
+    instant_s = recording.timeline().time_s
     if len(instant_s) != count:
         raise InputError(
             file,

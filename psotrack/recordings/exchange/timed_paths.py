@@ -1,21 +1,22 @@
-"""Paths of single drones with times and without frame numbers, and the frames to which their times belong."""
+"""Tracks of other programs on the clock of a recording: their times say to which frames they belong."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, Timeline
 from psotrack.trajectories import Trajectories, merged, resample
 
+_logger = logging.getLogger(__name__)
 #: Largest number of a frame.
 _LARGEST_FRAME = 2**31
-#: Largest distance of a time from an instant whose frame number it gets, in intervals. Times that are rounded to
-#: milliseconds are within the limit up to 40 frames per second. In 2 % of an interval of 40 ms, a drone at 2 m/s flies
-#: 1.6 mm. All other times are brought to the instants by interpolation.
+#: Largest distance of a time from a multiple of the tracks' own interval, in intervals.
 _SAME = 0.02
 #: Longest gap between two samples over which positions are interpolated, in intervals between samples: one missing
 #: sample is a gap, and stays one.
@@ -46,11 +47,6 @@ def timed_path(
         orientation_wxyz=orientation_wxyz[:, None] if orientation_wxyz is not None and turned else None,
         covariance_m2=None if covariance_m2 is None else covariance_m2[:, None],
     )
-
-
-def instants_s(recording: Recording | None) -> Float[np.ndarray, "instants"] | None:
-    """(instants,), times of a recording's instants, seconds; None if no recording is known."""
-    return None if recording is None else recording.timeline().time_s.astype(np.float64)
 
 
 def interval_s(trajectories: Trajectories) -> float:
@@ -88,32 +84,68 @@ def joined(where: object, paths: Sequence[Trajectories], recording: Recording | 
     if not any(path.num_frames for path in paths):
         raise InputError(where, expected="at least one pose", found="none")
     all_s = np.unique(np.concatenate([path.time_s for path in paths]))
-    instant_s = instants_s(recording)
-    if instant_s is not None:
-        _check_clock(where, all_s, instant_s)
-        at_instants = [_instants_of(path.time_s, instant_s) for path in paths]
+    timeline = None if recording is None else recording.timeline()
+    if timeline is not None:
+        _check_clock(where, paths, timeline)
+        at_instants = [timeline.numbers_of(path.time_s) for path in paths]
         frames = [frame for frame in at_instants if frame is not None]
         if len(frames) == len(paths):
-            return merged(paths, frames, lambda frame: instant_s[frame])
-    own_s = _own_interval_s(paths)
+            return merged(paths, frames, lambda frame: timeline.time_s[frame])
+    own_s = own_interval_s(paths)
     if own_s is not None:
         frames = [np.round(path.time_s / own_s).astype(np.int64) for path in paths]
         return merged(paths, frames, lambda frame: frame * own_s)
-    if instant_s is None:
+    if timeline is None:
         frames = [np.searchsorted(all_s, path.time_s) for path in paths]
         return merged(paths, frames, lambda frame: all_s[frame])
-    return _interpolated(where, paths, instant_s)
+    return _interpolated(where, paths, timeline.time_s)
 
 
-def _check_clock(
-    where: object, all_s: Float[np.ndarray, "times"], instant_s: Float[np.ndarray, "instants"]
-) -> None:
-    if all_s[-1] < instant_s[0] - 1 or all_s[0] > instant_s[-1] + 1:
+def on_clock(where: object, tracks: Trajectories, recording: Recording | None) -> Trajectories:
+    """Tracks of a file with frame numbers and times: the times decide, as they do in formats that have no numbers.
+
+    The tracks stay as they are where both agree, be it with the recording's instants or with a rate of their own.
+    Otherwise `joined` finds the frames, a warning says so, and the status is lost with the old frames.
+
+    Args:
+        where: the file, for messages.
+        tracks: the tracks.
+        recording: the recording, or None if none is known.
+
+    Raises:
+        InputError: no time is within the recording.
+    """
+    if recording is None or not tracks.num_frames:
+        return tracks
+    timeline, frame, time_s = recording.timeline(), tracks.frame, tracks.time_s
+    _check_clock(where, [tracks], timeline)
+    own_s = float(time_s[-1] / frame[-1]) if frame[-1] else 1 / recording.fps
+    own_rate = own_s > 0 and bool(np.abs(time_s / own_s - frame).max() <= _SAME)
+    if timeline.has(frame, time_s) or own_rate:
+        return tracks
+    position_m = np.where(tracks.seen[..., None], tracks.position_m, np.nan)
+    found = joined(where, [replace(tracks, position_m=position_m, status=None, num_cameras=None)], recording)
+    instants = np.minimum(frame, timeline.num_instants - 1)
+    row = int(np.argmax(np.abs(timeline.time_s[instants] - time_s)))
+    there = int(np.argmin(np.abs(timeline.time_s - time_s[row])))
+    _logger.warning(
+        "%s: frame numbers and times disagree, and the times decide: frame %d is at %.6g s, where the recording has "
+        "frame %d (%.6g s)", where, frame[row], time_s[row], there, timeline.time_s[there],
+    )  # fmt: skip
+    return found
+
+
+def _check_clock(where: object, paths: Sequence[Trajectories], timeline: Timeline) -> None:
+    """Raise `InputError` for times outside of the recording, or in another unit than seconds."""
+    time_s = np.unique(np.concatenate([path.time_s for path in paths]))
+    begin_s, end_s = timeline.time_s[[0, -1]]
+    unit = timeline.unit_of(time_s)
+    if unit or time_s[-1] < begin_s - 1 or time_s[0] > end_s + 1:
         raise InputError(
             where,
-            expected=f"times on the recording's clock, {instant_s[0]:g} to {instant_s[-1]:g} s",
-            found=f"{all_s[0]:.6g} to {all_s[-1]:.6g} s",
-            remedy="subtract the time at which the recording begins",
+            expected=f"times on the recording's clock, {begin_s:g} to {end_s:g} s",
+            found=f"{time_s[0]:.6g} to {time_s[-1]:.6g}{f', which look like {unit}' if unit else ' s'}",
+            remedy="write seconds" if unit else "subtract the time at which the recording begins",
         )
 
 
@@ -122,21 +154,7 @@ def _usual_interval_s(time_s: Float[np.ndarray, "rows"]) -> float:
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
 
 
-def _instants_of(
-    time_s: Float[np.ndarray, "rows"], instant_s: Float[np.ndarray, "instants"]
-) -> Int[np.ndarray, "rows"] | None:
-    """Numbers of the instants with these times; None unless every time has an instant of its own."""
-    if len(instant_s) < 2:
-        return np.zeros(len(time_s), np.int64) if len(time_s) == 1 else None
-    after = np.clip(np.searchsorted(instant_s, time_s), 1, len(instant_s) - 1)
-    nearest = np.where(time_s - instant_s[after - 1] <= instant_s[after] - time_s, after - 1, after)
-    limit_s = _SAME * _usual_interval_s(instant_s)
-    if (np.abs(instant_s[nearest] - time_s) > limit_s).any() or (np.diff(nearest) <= 0).any():
-        return None
-    return nearest.astype(np.int64)
-
-
-def _own_interval_s(paths: Sequence[Trajectories]) -> float | None:
+def own_interval_s(paths: Sequence[Trajectories]) -> float | None:
     """The interval of which all times of all paths are multiples; None without such an interval."""
     shortest_s = min(_usual_interval_s(path.time_s) for path in paths)
     longest = max(paths, key=lambda path: np.ptp(path.time_s) if path.num_frames else 0.0)

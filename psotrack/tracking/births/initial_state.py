@@ -12,6 +12,7 @@ from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, looking_depths_m
 from psotrack.recordings import Recording
+from psotrack.recordings.exchange import read_tracks
 from psotrack.settings import DroneSettings
 from psotrack.tracking.births.births import (
     NO_DRONES,
@@ -22,7 +23,7 @@ from psotrack.tracking.births.births import (
     state_at,
 )
 from psotrack.tracking.matching import Expected, crossings, from_silhouettes, wide_bounds
-from psotrack.trajectories import Tracks, Trajectories, read_trajectories
+from psotrack.trajectories import Tracks, Trajectories
 
 #: Number of first frames from which the sizes of drones at given positions are taken, and in which drones are found
 #: for a method that is plugged in.
@@ -72,7 +73,7 @@ def start_source(recording: Recording, init: str) -> StartSource:
     if init == "auto":
         return StartSource(init, recording.folder)
     if init != "truth":
-        return StartSource(init, Path(init), read_trajectories(Path(init), fps=recording.fps))
+        return StartSource(init, Path(init), read_tracks(init, recording=recording))
     if recording.truth is None:
         raise InputError(
             recording.folder, expected="a reference for --init truth", found="none", remedy="use --init auto"
