@@ -27,7 +27,7 @@ from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.recordings.image_files import check_pixels, depth_of, read_image
 from psotrack.recordings.opencv_messages import silence_opencv
 from psotrack.recordings.timing import MOST_INSTANTS, FrameTimes
-from psotrack.support import digest_file, digest_record
+from psotrack.support import check_kind, digest_file, digest_record
 
 _logger = logging.getLogger(__name__)
 #: Largest number of images of which the depth is read.
@@ -97,6 +97,7 @@ def probe(path: Path | str) -> VideoInfo:
         InputError: the file does not exist, is empty, is not a video, has no frames, or none that can be decoded.
     """
     path = Path(path)
+    check_kind(path, "a video")
     with open_capture(path) as capture, silence_opencv():
         stated = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         fps = capture.get(cv2.CAP_PROP_FPS)

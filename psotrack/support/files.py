@@ -38,6 +38,19 @@ Algorithm = Literal["blake2b", "blake2b-160", "sha256"]
 
 #: Names that `atomic_write` gives: stem of the output, machine and process that write, and a random part.
 _TEMPORARY = re.compile(r"\.(.*)\.([0-9a-f]{4})-([0-9]+)-[0-9a-f]{8}\.partial")
+_TO_C3D = "export C3D from that program"
+#: First bytes of files that are not what their names say -> what they are, and what to do.
+_OTHERS = {
+    b"version https://git-lfs.github.com/": (
+        "a Git LFS pointer, not the file itself",
+        "`git lfs pull` gets the file",
+    ),
+    b"#ROSBAG V": ("a ROS 1 bag", "make MCAP of it with `rosbags-convert --dst-storage mcap`"),
+    b"Format Version,": ("a table of OptiTrack Motive", _TO_C3D),
+    b"Trajectories": ("a table of Vicon Nexus", _TO_C3D),
+    b"NO_OF_FRAMES": ("a table of Qualisys Track Manager", _TO_C3D),
+    b"PathFileType": ("a table of markers for OpenSim (TRC)", _TO_C3D),
+}
 #: Temporary files that this process writes just now.
 _OPEN: set[Path] = set()
 
@@ -274,8 +287,9 @@ def read_text(path: Path | str) -> str:
     """Read a UTF-8 text file, without the byte order mark that spreadsheet programs write first.
 
     Raises:
-        InputError: the file cannot be read or is not UTF-8 text.
+        InputError: the file cannot be read, is not UTF-8 text, or is a known file of another program.
     """
+    check_kind(path, "a text that psotrack reads")
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -287,6 +301,20 @@ def read_text(path: Path | str) -> str:
         ) from error
     check_no_nul(path, text)
     return text
+
+
+def check_kind(path: Path | str, expected: str) -> None:
+    """Raise `InputError` for a file whose first bytes are those of another program's kind of file, which it names.
+
+    Args:
+        path: the file; one that cannot be read passes.
+        expected: noun phrase for the file, for the message.
+    """
+    with contextlib.suppress(OSError), Path(path).open("rb") as file:
+        start = file.read(100).removeprefix(b"\xef\xbb\xbf")
+        for first, (found, remedy) in _OTHERS.items():
+            if start.startswith(first):
+                raise InputError(path, expected=expected, found=found, remedy=remedy)
 
 
 def check_no_nul(path: Path | str, text: str) -> None:

@@ -44,6 +44,8 @@ SCHEMA_VERSION = 1
 _LEAST_CELLS, _CELLS_PER_ROW = 1_000_000, 100
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
+#: Separators of columns that other programs write.
+_SEPARATORS = {";": "semicolons", "\t": "tabs"}
 #: Index of the covariance column for each element of the matrix.
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _STATUS = {status.label: status for status in Status}
@@ -226,8 +228,10 @@ def _read_csv(path: Path) -> DroneRows:
         try:
             return float(word or "nan")
         except ValueError:
-            found = repr(word)
-            raise InputError(f"{path}, line {line}", expected=f"a number in {name}", found=found) from None
+            remedy = "write decimals with a point" if "," in word else ""
+            raise InputError(
+                f"{path}, line {line}", expected=f"a number in {name}", found=repr(word), remedy=remedy
+            ) from None
 
     columns: dict[str, np.ndarray] = {}
     for name in [name for name in ALL_COLUMNS if name in header]:
@@ -281,6 +285,10 @@ def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray
 
 
 def _check_columns(path: Path, names: list[str]) -> None:
+    other = next((word for mark, word in _SEPARATORS.items() if len(names) == 1 and mark in names[0]), "")
+    if other:
+        remedy = "write commas between columns, and points in decimals"
+        raise InputError(path, expected="columns separated by commas", found=other, remedy=remedy)
     missing = [name for name in _REQUIRED if name not in names]
     twice = [name for name in ALL_COLUMNS if names.count(name) > 1]
     if missing or twice:

@@ -22,6 +22,7 @@ from psotrack.pipeline import archives
 from psotrack.recordings import probe, read_frames, read_image
 from psotrack.recordings.datasets import open_recording, read_masks, read_poses
 from psotrack.recordings.exchange import read_tracks
+from psotrack.recordings.mocap import read_c3d
 from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.trajectories import read_trajectories
 
@@ -68,6 +69,7 @@ COMMANDS = {
     "simulate S99 --out out": ["S99", "S02_D4_A"],
     "simulate S02_D4_A --out out --frames 100000": ["frames"],
     "evaluate late.csv {flight}": ["late.csv", "0 to 0.52 s, found 5000 to 5001 s"],
+    "evaluate ms.csv {flight}": ["ms.csv", "found 0 to 520, which look like milliseconds; write seconds"],
     "evaluate one.csv {flight} --plot my.jpg": ["--plot", "ends in .png", "my.jpg"],
     f"calibrate rig left right {BOARD}": ["left and 1 more"],
     "track one_video --out out.csv --method fused": [
@@ -95,6 +97,7 @@ def files(flight, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     texts = {
         "late.csv": f"{HEAD}5000,5000,a,0,0,1\n5001,5001,a,0,0,1\n",
+        "ms.csv": HEAD + "".join(f"{k},{40 * k},a,0,0,1\n" for k in range(14)),
         "one.csv": f"{HEAD}0,0,a,0,0,1\n",
         "digits.csv": f"{CORNERS}{HUGE}{ZEROS}",
         "run.toml": "swarm.particles = -5\n",
@@ -177,6 +180,7 @@ def test_a_record_made_in_python_has_the_limits(tmp_path):
 
 # --- files
 
+LFS = "version https://git-lfs.github.com/spec/v1"
 NUL = "expected UTF-8 text, found a NUL"
 FRAME = "line 2: expected a whole number from 0 in frame"
 
@@ -215,6 +219,49 @@ TEXTS = {
     ),
     "thousands of empty drones": ("t.json", json_of_empty_drones(), read_tracks, ["t.json"]),
     "a NUL in a row": ("t.csv", f"{HEAD}0,0,a\0,0,0,1\n", read_trajectories, ["t.csv", NUL]),
+    "semicolons": (
+        "t.csv",
+        HEAD.replace(",", ";"),
+        read_trajectories,
+        ["separated by commas, found semicolons"],
+    ),
+    "a decimal comma": (
+        "t.csv",
+        f'{HEAD}0,0,a,"0,5",0,1\n',
+        read_trajectories,
+        ["line 2", "decimals with a point"],
+    ),
+    "a pointer of Git LFS": (
+        "a.c3d",
+        f"{LFS}\noid sha256:0\n",
+        read_c3d,
+        ["a.c3d", "found a Git LFS pointer", "git lfs pull"],
+    ),
+    "a video that is a pointer": (
+        "a.mp4",
+        f"{LFS}\n",
+        probe,
+        ["a.mp4: expected a video, found a Git LFS pointer"],
+    ),
+    "a ROS 1 bag": ("a.bag", "#ROSBAG V2.0\n", read_tracks, ["found a ROS 1 bag", "rosbags-convert"]),
+    "a table of Motive": (
+        "a.csv",
+        "\ufeffFormat Version,1.23,Take Name,a\n\n,,Type\n",
+        read_tracks,
+        ["OptiTrack Motive; export C3D"],
+    ),
+    "poses of Motive": (
+        "a.csv",
+        "Format Version,1.23,Take Name,a\n\n,,Type\n",
+        read_poses,
+        ["OptiTrack Motive; export C3D"],
+    ),
+    "a table of Nexus": (
+        "a.csv",
+        "Trajectories\n100\n",
+        read_poses,
+        ["found a table of Vicon Nexus; export C3D"],
+    ),
     "a NUL in TOML": ("recording.toml", "version = 1\n#\0\n", open_recording, ["recording.toml", NUL]),
 }
 

@@ -57,6 +57,9 @@ def read_reference(
             "%.3f s on the recording's clock; see [reference] time_offset_s",
             time_s[0], time_s[-1], begin_s, end_s,
         )  # fmt: skip
+    for path, each in zip(files, found, strict=True):
+        if unit := timeline.unit_of(each.time_s):
+            _logger.warning("%s: its times look like %s: write seconds", path, unit)
     own = finest = max(found, key=lambda each: each.num_frames)
     if len(found) > 1:
         own = _at_times(found, finest.frame, finest.time_s, later_s=0.0)

@@ -15,7 +15,7 @@ from psotrack.recordings.exchange.kitti_files import POSES, read_kitti, write_ki
 from psotrack.recordings.exchange.mcap_files import read_mcap, write_mcap
 from psotrack.recordings.exchange.mot_files import TRACKS, WORLD, read_mot_positions, write_mot
 from psotrack.recordings.exchange.timed_paths import joined, on_clock, timed_path
-from psotrack.support import Report, are_numbers, first_line, number_words
+from psotrack.support import Report, are_numbers, check_kind, first_line, number_words
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 from psotrack.trajectories.tum import read_tum, tum_text, write_tum
 
@@ -106,6 +106,7 @@ def read_tracks(path: Path | str, *, recording: Recording | None = None) -> Traj
     path = Path(path)
     if not path.exists():
         raise InputError(path, expected="a file or folder of tracks", found="no such file or folder")
+    check_kind(path, "tracks")
     read = _read_folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
         raise InputError(path, expected=_KINDS, found=repr(path.name))

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.mocap.c3d_format import BLOCK_BYTES, Header, Parameters, Processor, read_layout
 from psotrack.recordings.timing import check_rate
-from psotrack.support import atomic_write, short_repr
+from psotrack.support import atomic_write, check_kind, short_repr
 
 _logger = logging.getLogger(__name__)
 _METRES_PER_UNIT = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "m": 1.0, "in": 0.0254, "ft": 0.3048}
@@ -82,6 +82,7 @@ def read_c3d(path: Path | str) -> Markers:
             away from everything that motion capture can see, or its length unit is unknown.
     """
     path = Path(path)
+    check_kind(path, "a C3D file")
     try:
         content = path.read_bytes()
     except OSError as error:
