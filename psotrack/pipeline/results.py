@@ -30,6 +30,7 @@ from psotrack.tracking.births import (
 )
 from psotrack.tracking.camera_errors import TrackErrors
 from psotrack.tracking.identity import Identities, postprocess
+from psotrack.tracking.matching import are_near, from_silhouettes
 from psotrack.trajectories import Status, Tracks, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)
@@ -39,6 +40,11 @@ logger = logging.getLogger(__name__)
 _FEW_MET = 0.2
 #: A camera that shows nothing in a larger share of the instants at which it should, and for a second, is named.
 _BLIND_SHARE = 0.5
+#: Number of frames in which explained detections are counted.
+_COUNTED_FRAMES = 100
+#: Tracks and a camera's detections do not belong together where less than this share of both has a partner: false
+#: detections leave detections alone, missing ones leave tracks alone. Fewer detections than this number say nothing.
+_FEW_EXPLAINED, _TOO_FEW = 0.5, 10
 #: Settings that the data give where nobody does, and the key of the record's `volume` that says which.
 _FOUND = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
 
@@ -128,6 +134,7 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         return _no_drones(run)
     warn_of_missing_drones(settings, tracks.num_drones)
     began = time.perf_counter()
+    explained = _explained(run, tracks)
     # How errors fade is known once the whole recording was seen.
     smoothing = settings.motion if errors is None else errors.smoothing(settings.motion)
     trajectories, identities = postprocess(
@@ -188,6 +195,7 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
         "points": result.points,
         "ellipsoid": centre_of_ellipsoids((point["middle_of"] for point in result.points), settings.drones),
+        "explained": explained,
         "camera_errors": {} if errors is None else errors.record(recording.rig.names),
         "encounters": [asdict(encounter) for encounter in identities.encounters],
         "input_keys": dict(result.input_keys),
@@ -196,6 +204,44 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         **environment(),
     }
     return TrackedRecording(trajectories, tracks.size_m, identities, record)
+
+
+def _explained(run: Run, tracks: Tracks) -> dict[str, Any]:
+    """Shares of the detections that are near a track, of all cameras and of each, in frames that have tracks.
+
+    Warns of cameras whose detections and the tracks do not belong together, as with a wrong rig.
+    """
+    rig, cameras = run.recording.rig, run.recording.rig.cameras
+    tracked = np.asarray(tracks.status == Status.TRACKED)
+    frames = np.flatnonzero(tracked.any(axis=1))
+    spread = np.linspace(0, len(frames) - 1, min(len(frames), _COUNTED_FRAMES)).round().astype(int)
+    seen, explained, in_view, found = np.zeros((4, len(rig)), int)
+    for frame in frames[spread].tolist():
+        one = slice(frame, frame + 1)
+        if run.sightings is not None:
+            sightings = run.sightings[one]
+        else:
+            assert run.silhouettes is not None, "a run has silhouettes or sightings"
+            sightings = from_silhouettes(run.silhouettes, first=frame, stop=frame + 1)
+        position_m = np.where(tracked[one, :, None], np.asarray(tracks.position_m[one], float), np.nan)
+        near = are_near(cameras, sightings, position_m, np.asarray(tracks.velocity_m_s[one], float))
+        seen += np.isfinite(sightings.noise_px).sum(axis=(0, 2))
+        explained += near.any(axis=1).sum(axis=(0, 2))
+        visible = in_images(cameras, position_m)
+        in_view += visible.sum(axis=(0, 1))
+        found += (visible & near.any(axis=-1)).sum(axis=(0, 1))
+    few = (explained < _FEW_EXPLAINED * seen) & (found < _FEW_EXPLAINED * in_view) & (seen >= _TOO_FEW)
+    if few.any():
+        logger.warning(
+            "the tracks explain only %.0f %% of the detections of %s: place, lens, clock or detections may be wrong; "
+            "run `psotrack doctor %s`",
+            100 * explained[few].sum() / seen[few].sum(),
+            ", ".join(np.array(rig.names)[few]),
+            shlex.quote(f"{run.recording.folder}"),
+        )
+    shares = [float(part / whole) if whole else None for part, whole in zip(explained, seen, strict=True)]
+    share = float(explained.sum() / seen.sum()) if seen.any() else None
+    return {"share": share, "cameras": dict(zip(rig.names, shares, strict=True))}
 
 
 def centre_of_ellipsoids(middle_of: Iterable[str], drones: DroneSettings) -> str:

@@ -19,6 +19,7 @@ from psotrack.calibration.doctor import evidence, examine
 from psotrack.calibration.doctor.common_points import CommonPoints
 from psotrack.calibration.doctor.corrections import PER_CAMERA, Corrected, WeightedPoints, linearise, weigh
 from psotrack.geometry import Rig
+from psotrack.recordings import Detections
 from psotrack.tracking.matching import from_detections
 from psotrack.trajectories import Trajectories
 
@@ -181,15 +182,19 @@ def test_detections_of_different_flights_accuse_no_camera():
     assert finding.kind == "no agreement"
 
 
-def test_two_cameras_are_checked():
-    """Two cameras show whether they agree, but not which of them is wrong."""
-    two = World(cameras=2, frames=200)
-    diagnosis = two.examined(reference_m=two.truth_m)
+@pytest.mark.parametrize(("cameras", "of_third"), [(2, None), (3, 0), (3, 10)])
+def test_two_cameras_are_checked(cameras, of_third):
+    """Two cameras show whether they agree, but not which of them is wrong; a third may see next to nothing."""
+    world = World(cameras=cameras, frames=200)
+    seen, two = dict(world.seen), world.rig.names[:2]
+    for name in world.rig.names[2:]:
+        seen[name] = Detections(*(values[:of_third] for values in vars(seen[name]).values()))
+    diagnosis = world.examined(reference_m=world.truth_m, seen=seen)
     assert diagnosis.findings == ()
     assert diagnosis.to_dict()["explained"] > 0.85
-    (finding,) = two.examined(turned(two.rig, 1, (1, 0, 0))).findings
+    (finding,) = world.examined(turned(world.rig, 1, (1, 0, 0)), seen=seen).findings
     assert finding.kind == "unclear"
-    assert finding.cameras == two.rig.names
+    assert finding.cameras == two
 
 
 OUTDOORS = {
@@ -202,15 +207,37 @@ OUTDOORS = {
 }
 
 
-def test_a_rig_that_explains_nothing_is_not_sound():
-    """Every camera is turned by about a degree, tens of pixels: no three agree, and no single fault explains it."""
+def all_turned(rig, degrees):
+    """The rig with every camera turned by about as much."""
+    turns = np.array([(0.4, 0.9, 0.2), (0.2, 0.4, 0.9), (0.9, 0.2, 0.4)])
+    for index in range(len(rig)):
+        rig = turned(rig, index, degrees * turns[index % 3])
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("degrees", "kinds"), [(0.5, {"several"}), (1.0, {"several", "no agreement"}), (4.0, {"no agreement"})]
+)
+def test_a_rig_that_explains_nothing_is_not_sound(degrees, kinds):
+    """Every camera is turned, by tens of pixels: no single fault explains it."""
     world = World(**OUTDOORS)
-    rig = turned(world.rig, 0, (0.4, 0.9, 0.2))
-    rig = turned(rig, 1, (0.2, 0.4, 0.9))
-    rig = turned(rig, 2, (0.9, 0.2, 0.4))
-    diagnosis = world.examined(rig)
+    diagnosis = world.examined(all_turned(world.rig, degrees))
     assert diagnosis.to_dict()["explained"] < 0.05
+    assert {finding.kind for finding in diagnosis.findings} <= kinds
     assert diagnosis.findings
+
+
+@pytest.mark.slow
+def test_tracks_say_which_share_of_the_detections_they_explain(tmp_path, caplog):
+    """False detections are no fault of the rig."""
+    world = World(cameras=3, drones=1, frames=50, false_alarms=1.0)
+    for name, degrees, low, high in [("sound", 0.0, 0.4, 0.6), ("wrong", 3.0, 0.0, 0.1)]:
+        folder = record_detections(tmp_path / name, world.seen, all_turned(world.rig, degrees))
+        caplog.clear()
+        explained = pt.track(folder, method="projection-lines").record["explained"]
+        assert low <= explained["share"] <= high
+        assert list(explained["cameras"]) == list(world.rig.names)
+        assert ("the tracks explain only" in caplog.text) == (name == "wrong"), caplog.text
 
 
 def test_errors_that_last_look_like_no_turn():

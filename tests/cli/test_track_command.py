@@ -32,7 +32,8 @@ ERRORS = [
 #: Keys of the record beside the tracks, of every method; the contract promises more, where they have a meaning.
 RECORD = {
     *("rate_hz", "camera_times", "settings", "seed", "versions", "device", "input_keys", "start", "volume"),
-    *("drones", "arrivals", "points", "left_out", "ellipsoid", "camera_errors", "encounters"),
+    *("drones", "arrivals", "points", "left_out", "ellipsoid", "explained"),
+    *("camera_errors", "encounters"),
     *("seconds", "real_time_factor", "real_time_factor_running"),
 }
 NUM_FRAMES = 12

@@ -165,12 +165,14 @@ def test_events_of_the_record_are_shown_at_their_times():
 def test_the_quality_of_cameras():
     record = {
         "camera_errors": {"cameras": {"c1": {"noise_px": [3.0, 4.0], "lasting_px": [0.1, 0.1]}}},
+        "explained": {"share": 0.9, "cameras": {"c1": 0.75}},
         "left_out": {"c2": [[0, 4], [6, 7]]},
     }
     short = recording_of(ring_rig(3), times={"c2": FrameTimes(NUM_FRAMES // 2, RATE_HZ)})
     rows = camera_quality(flight_with(record).tracks[0], short).set_index("camera")
     assert rows["frames"].tolist() == [1.0, 1.0, 0.5]
     assert rows.loc["c1", "noise_px"] == pytest.approx(np.sqrt(12.5))
+    assert rows.loc["c1", "explained"] == 0.75
     assert rows["left_out"].tolist() == [0, 0, 5]
     assert (rows["in_view"] <= 1).all()
 

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.geometry import Rig, to_camera, triangulate_linearly, viewpoints
 from psotrack.geometry.estimation import cauchy_weight
-from psotrack.tracking.matching import BORDER_PX, Sightings, match
+from psotrack.tracking.matching import BORDER_PX, Sightings, are_near, by_image, match
 
 #: Standard deviation of the direction of a camera's rays that a fault may cause, degrees.
 LOOSE_DEG = 0.7
@@ -24,6 +24,8 @@ _STEP = 0.06
 _BLOCK_FRAMES = 15
 #: Smallest number of points of a piece of a path.
 _MIN_PIECE = 4
+#: Three viewpoints must agree where this share of the frames that two of them see is seen by three.
+_SEEN_BY_THREE = 0.3
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class CommonPoints:
         information: (points, cameras), part of a sighting's information that this point may use: a slow camera shows
             one frame at several instants.
         share: (cameras,), fraction of each camera's sightings that are matched.
+        viewpoints: smallest number of viewpoints of a point.
     """
 
     frame: Int[np.ndarray, "points"]
@@ -52,6 +55,7 @@ class CommonPoints:
     offset_frames: Float[np.ndarray, "points cameras"]
     information: Float[np.ndarray, "points cameras"]
     share: Float[np.ndarray, "cameras"]
+    viewpoints: int = 3
 
     @property
     def seen(self) -> Bool[np.ndarray, "points cameras"]:
@@ -80,6 +84,12 @@ class ExaminedFrames:
         """(cameras,), numbers of sightings."""
         return np.isfinite(self.sightings.noise_px[self.frames]).sum(axis=(0, 2))
 
+    def viewpoints(self, rig: Rig) -> int:
+        """Smallest number of viewpoints of a point: three where three see enough, because two agree by chance."""
+        seen = np.isfinite(self.sightings.noise_px[self.frames]).any(axis=-1)
+        together = _count_viewpoints(rig, seen)
+        return 3 if (together >= 3).sum() > _SEEN_BY_THREE * (together >= 2).sum() else 2
+
     def by(self, index: list[int]) -> ExaminedFrames:
         """What some of the cameras see."""
         exposures = self.sightings.exposures
@@ -88,8 +98,8 @@ class ExaminedFrames:
 
     def matched(
         self, rig: Rig, loose_deg: float = 0.0
-    ) -> tuple[Int[np.ndarray, "groups"], Int[np.ndarray, "groups cameras"]]:
-        """Frames of groups of sightings that may show one body, and indices of the sightings, -1 for none.
+    ) -> tuple[Int[np.ndarray, "groups"], Int[np.ndarray, "groups cameras"], Float[np.ndarray, "groups 3"]]:
+        """Groups of sightings that may show one body: frames, indices of the sightings, -1 for none, and positions.
 
         Args:
             rig: the cameras.
@@ -97,8 +107,8 @@ class ExaminedFrames:
         """
         loose_px = np.tan(np.deg2rad(loose_deg)) * np.sqrt(rig.cameras.K[:, 0, 0] * rig.cameras.K[:, 1, 1])
         noise_px = np.hypot(self.sightings.noise_px, loose_px[:, None])
-        least = max(least_viewpoints(rig), 2)
-        numbers, found = [np.empty(0, int)], [np.empty((0, len(rig)), int)]
+        least = self.viewpoints(rig)
+        numbers, found, places_m = [np.empty(0, int)], [np.empty((0, len(rig)), int)], [np.empty((0, 3))]
         for frame in self.frames.tolist():
             seen_px = self.sightings.centre_px[frame]
             try:
@@ -109,21 +119,22 @@ class ExaminedFrames:
             except np.linalg.LinAlgError:
                 # A rig can be so wrong that the equations are singular.
                 continue
-            found.append(matches.detection)
-            numbers.append(np.full(len(matches.detection), frame))
-        return np.concatenate(numbers), np.concatenate(found)
+            enough = _count_viewpoints(rig, matches.detection >= 0) >= least
+            found.append(matches.detection[enough])
+            places_m.append(matches.position_m[enough])
+            numbers.append(np.full(enough.sum(), frame))
+        return np.concatenate(numbers), np.concatenate(found), np.concatenate(places_m)
 
     def explained(self, rig: Rig) -> Int[np.ndarray, "cameras"]:
-        """(cameras,), numbers of sightings that agree with those of other cameras."""
-        frame, detection = self.matched(rig)
-        enough = _has_enough(rig, detection >= 0)
-        frame, detection = frame[enough], detection[enough]
-        return np.array([len({*zip(frame[of >= 0], of[of >= 0], strict=True)}) for of in detection.T])
+        """(cameras,), numbers of sightings that are near a point at which enough viewpoints agree."""
+        frame, _, position_m = self.matched(rig)
+        position_m = by_image(np.searchsorted(self.frames, frame), position_m, len(self.frames))
+        return are_near(rig.cameras, self.sightings[self.frames], position_m).any(axis=1).sum(axis=(0, 2))
 
     def common_points(self, rig: Rig) -> CommonPoints:
         """Match the sightings over all cameras loosely, and link the points of consecutive frames."""
         cameras, sightings = rig.cameras, self.sightings
-        frame, detection = self.matched(rig, LOOSE_DEG)
+        frame, detection, _ = self.matched(rig, LOOSE_DEG)
         used = np.zeros(len(rig))
         for camera, of in enumerate(detection.T):
             boxes, of_box, count = np.unique(
@@ -139,7 +150,9 @@ class ExaminedFrames:
         seen = (detection >= 0) & ~cut & np.isfinite(centre_px).all(axis=-1)
         centre_px = np.where(seen[..., None], centre_px, np.nan)
         position_m = triangulate_linearly(cameras, centre_px)
-        kept = np.flatnonzero(_has_enough(rig, seen) & np.isfinite(position_m).all(axis=-1))
+        least = self.viewpoints(rig)
+        enough = _count_viewpoints(rig, seen) >= least
+        kept = np.flatnonzero(enough & np.isfinite(position_m).all(axis=-1))
         piece = _link(rig, frame[kept], position_m[kept])
         long = np.bincount(piece, minlength=1)[piece] >= _MIN_PIECE
         kept, piece = kept[long], np.unique(piece[long], return_inverse=True)[1]
@@ -162,19 +175,15 @@ class ExaminedFrames:
             self.fps * offset_s,
             information,
             used / np.maximum(self.count, 1),
+            least,
         )
 
 
-def least_viewpoints(rig: Rig) -> int:
-    """Smallest number of viewpoints of a point: three, because two often agree by chance, if the rig has three."""
-    return min(3, len(np.unique(viewpoints(rig.cameras))))
-
-
-def _has_enough(rig: Rig, seen: Bool[np.ndarray, "points cameras"]) -> Bool[np.ndarray, "points"]:
-    """Whether each point is seen from enough viewpoints."""
+def _count_viewpoints(rig: Rig, seen: Bool[np.ndarray, "rows cameras"]) -> Int[np.ndarray, "rows"]:
+    """(rows,), numbers of viewpoints that see something."""
     label = viewpoints(rig.cameras)
     at = label[:, None] == np.unique(label)
-    return (seen.astype(int) @ at.astype(int) > 0).sum(axis=-1) >= least_viewpoints(rig)
+    return (seen.astype(int) @ at.astype(int) > 0).sum(axis=-1)
 
 
 def _link(

@@ -135,13 +135,13 @@ def weigh(corrected: Corrected, points: CommonPoints) -> WeightedPoints:
         # The fit has three unknowns per point, and follows the noise.
         freedom = 1 - 1.5 / np.maximum((weight > 0).sum(axis=1, keepdims=True), 2)
         scale = np.nan_to_num(medians(distance)) / _RAYLEIGH_MEDIAN
-        if len(scale) == 2:
+        if points.viewpoints == 2:
             # Two cameras show only the noise of both together.
-            scale = np.full(2, np.sqrt(np.mean(scale**2)))
+            scale = np.full(len(scale), np.sqrt(np.square(scale).sum() / max((scale > 0).sum(), 1)))
         std = np.maximum(scale, 0.1) / np.sqrt(freedom)
         robust = cauchy_weight((np.nan_to_num(distance) / std / _OUTLIER_STD) ** 2) ** 2
         used = there & (robust > 0.02)
-        used &= used.sum(axis=1, keepdims=True) >= min(3, used.shape[1])
+        used &= used.sum(axis=1, keepdims=True) >= points.viewpoints
         weight = np.where(used, robust * points.information / (std * sigma_px) ** 2, 0.0)
     return WeightedPoints(points, position_m, weight)
 

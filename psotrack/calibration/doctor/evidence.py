@@ -48,7 +48,7 @@ _PARTS = {
 }
 #: Logarithms of the prior probabilities of rarer kinds, relative to the others: who pushes a camera turns it, and the
 #: perspective of extended bodies and boxes that merge look a little like a fault of all lenses.
-_LOG_PRIOR = {"moved": -0.5, "turned and moved": -2.0, "focal lengths": -7.0}
+_LOG_PRIOR = {"moved": -0.5, "turned and moved": -2.0, "several": -7.0, "focal lengths": -7.0}
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Hypothesis:
     """A possible fault.
 
     Attributes:
-        kind: turned, moved, turned and moved, focal length or clock; focal lengths for all lenses together; clocks for
-            all videos.
+        kind: turned, moved, turned and moved, focal length or clock; several for turns of all cameras; focal lengths
+            for all lenses together; clocks for all videos.
         camera: index of the camera; -1 for all cameras.
         columns: indices of the parameters among those of the whole rig.
     """
@@ -136,13 +136,18 @@ class Evidence:
 
 
 def list_hypotheses(num_cameras: int, cameras: Sequence[int]) -> list[Hypothesis]:
-    """All hypotheses about some cameras of a rig, and the one about all lenses."""
+    """All hypotheses about some cameras of a rig, and those about all of them together."""
     found = [
         Hypothesis(kind, camera, tuple(PER_CAMERA * camera + part for part in parts))
         for camera in cameras
         for kind, parts in _PARTS.items()
     ]
-    return [*found, Hypothesis("focal lengths", -1, (PER_CAMERA * num_cameras,))]
+    turns = tuple(PER_CAMERA * camera + part for camera in cameras for part in _PARTS["turned"])
+    return [
+        *found,
+        Hypothesis("several", -1, turns),
+        Hypothesis("focal lengths", -1, (PER_CAMERA * num_cameras,)),
+    ]
 
 
 def gather(corrected: Corrected, data: WeightedPoints) -> Evidence:

@@ -3,7 +3,7 @@
 Sightings of a few runs of frames are matched over the cameras and triangulated. If they do not agree, other
 interpretations of the whole rig are tried (`rig_interpretations`). A camera that agrees with no other one is named.
 Small faults, of cameras and of clocks, are found by comparing all hypotheses on sightings that are matched loosely
-(`fault_search`). Last, the reference is compared.
+(`fault_search`); what they leave must be what boxes err. Last, the reference is compared.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames, least_viewpoints
+from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames
 from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, medians, misfit_px, weigh
 from psotrack.calibration.doctor.diagnosis import Diagnosis
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.findings import (
     Finding,
+    describe_disagreement,
     describe_fault,
     describe_gross_fault,
     describe_reference,
@@ -111,16 +112,18 @@ def examine(
         findings.append(unknown)
     else:
         lags = find_lags(rig, data)
-        findings += _find_faults(rig, seen, data, lags)
-        if not findings and explained.sum() < MIN_SHARE * total:
-            findings.append(_nothing_agrees(rig, seen, explained))
+        found, (off_std, name) = _find_faults(rig, seen, data, lags)
+        findings += found
+        unexplained = off_std > NEAR_STD or not (findings or explained.sum() >= MIN_SHARE * total)
+        if unexplained and all(finding.kind != "unclear" for finding in found):
+            share = explained.sum() / total
+            findings.append(describe_disagreement(share, total, seen.viewpoints(rig), off_std, name))
         if reference is not None:
             inside = points.frame < reference.num_frames
             reference_m, contradiction = describe_reference(
                 points.start_m[inside], reference.position_m[points.frame[inside]]
             )
             findings += contradiction
-    misfit = misfit_px(as_read, data)
     return Diagnosis(
         cameras=rig.names,
         fps=fps,
@@ -128,8 +131,8 @@ def examine(
         num_frames=len(frames),
         num_sightings=seen.count,
         num_explained=explained,
-        residual_px=medians(misfit),
-        residual_std=medians(misfit / (NOISE_PX + NOISE_SHARE * points.side_px)),
+        residual_px=medians(misfit_px(as_read, data)),
+        residual_std=_off_std(as_read, data),
         late_frames=lags[0],
         late_std_frames=lags[1],
         epipolar_px=_median_epipolar_distances(rig, points),
@@ -147,14 +150,16 @@ def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chose
 
 def _find_faults(
     rig: Rig, seen: ExaminedFrames, data: WeightedPoints, lags: Float[np.ndarray, "2 cameras"]
-) -> list[Finding]:
+) -> tuple[list[Finding], tuple[float, str]]:
     """Find faults of cameras, the largest first, each without the cameras that were found wrong before.
+
+    What they leave is returned, too: how far off the worst camera is then, standard deviations, and its name.
 
     The lags of wrong clocks are written into `lags`: to the estimate of all lags together, the sightings of a very
     late video are outliers.
     """
     findings: list[Finding] = []
-    names, rest = list(rig.names), rig
+    names, rest, left = list(rig.names), rig, Corrected(rig, np.zeros(len(rig)))
     # At least half of the cameras are taken as sound.
     while len(findings) < max(1, len(rig) // 2):
         finding = _gross_fault(rest, seen, data.points)
@@ -162,11 +167,12 @@ def _find_faults(
             fault = find_fault(rest, data)
             if fault is None or (findings and not fault.certain):
                 break
-            finding = describe_fault(rest, fault, seen.fps)
-            if least_viewpoints(rig) < 3:
+            finding, left = describe_fault(rest, fault, seen.fps), left.by(fault.best.step)
+            if seen.viewpoints(rest) < 3:
                 message = f"the cameras disagree, for example as if {finding.message}"
                 remedy = "two viewpoints do not show which camera is wrong: check both, or use more cameras"
-                finding = Finding("unclear", rig.names, message, remedy)
+                both = tuple(rest.names[each] for each in np.flatnonzero(data.used.any(axis=0)))
+                finding = Finding("unclear", both, message, remedy)
             if finding.kind == "clock":
                 column = list(fault.best.hypothesis.columns)
                 number = names.index(finding.cameras[0])
@@ -176,10 +182,17 @@ def _find_faults(
         if finding.kind == "unclear" or len(index) in (0, len(rest)):
             break
         seen, rest = seen.by(index), rest.select([rest.names[number] for number in index])
-        if least_viewpoints(rest) < 3:
+        if seen.viewpoints(rest) < 3:
             break
-        data = weigh(Corrected(rest, np.zeros(len(rest))), seen.common_points(rest))
-    return findings
+        left = Corrected(rest, np.zeros(len(rest)))
+        data = weigh(left, seen.common_points(rest))
+    off_std = np.nan_to_num(_off_std(left, data))
+    return findings, (float(off_std.max()), left.rig.names[int(off_std.argmax())])
+
+
+def _off_std(corrected: Corrected, data: WeightedPoints) -> Float[np.ndarray, "cameras"]:
+    """Median distances of the cameras' sightings from where the others put the bodies, standard deviations of boxes."""
+    return medians(misfit_px(corrected, data) / (NOISE_PX + NOISE_SHARE * data.points.side_px))
 
 
 def _gross_fault(rig: Rig, seen: ExaminedFrames, points: CommonPoints) -> Finding | None:
@@ -188,9 +201,10 @@ def _gross_fault(rig: Rig, seen: ExaminedFrames, points: CommonPoints) -> Findin
     for index in np.flatnonzero(points.share < SUSPECT_SHARE * np.median(points.share)).tolist():
         others = [number for number in range(len(rig)) if number != index]
         rest = rig.select([rig.names[number] for number in others])
-        if least_viewpoints(rest) < 3:
+        by_others = seen.by(others)
+        if by_others.viewpoints(rest) < 3:
             continue
-        known, boxes = seen.by(others).common_points(rest), seen.sightings
+        known, boxes = by_others.common_points(rest), seen.sightings
         noise_px = boxes.noise_px[known.frame, index]
         # A camera that seldom has a detection is not known to be wrong.
         if len(known.frame) < MIN_POINTS_OF_CAMERA or np.isfinite(noise_px).any(axis=1).mean() < 0.5:
@@ -255,7 +269,7 @@ def _why_unknown(
         )
         return Finding("too little seen", (), message, remedy)
     if not agree:
-        return _nothing_agrees(rig, seen, explained)
+        return describe_disagreement(explained.sum() / total, total, seen.viewpoints(rig))
     consistent = data.used.sum() / points.seen.sum()
     if consistent >= MIN_CONSISTENT:
         return None
@@ -264,20 +278,6 @@ def _why_unknown(
         "so the others agree by chance"
     )
     return Finding("too little seen", (), message, remedy)
-
-
-def _nothing_agrees(rig: Rig, seen: ExaminedFrames, explained: Int[np.ndarray, "cameras"]) -> Finding:
-    total, viewpoints = int(seen.count.sum()), "three" if least_viewpoints(rig) > 2 else "two"
-    message = (
-        f"the rig or the detections: {viewpoints} viewpoints agree on only {explained.sum() / total:.0%} of {total} "
-        "detections, under every interpretation of the rig"
-    )
-    # Blobs can be other parts of a body in each camera, if the body hardly moves: then the soundest rig disagrees.
-    remedy = (
-        "look whether the detections are of the same bodies in all cameras, and videos of this rig; "
-        "if they are, calibrate it anew"
-    )
-    return Finding("no agreement", (), message, remedy)
 
 
 def _median_epipolar_distances(rig: Rig, points: CommonPoints) -> Float[np.ndarray, "cameras cameras"]:

@@ -83,6 +83,7 @@ def find_fault(rig: Rig, data: WeightedPoints) -> FoundFault | None:
         data: points that were matched and weighted with this rig.
     """
     corrected = Corrected(rig, np.zeros(len(rig)))
+    shown_px = misfit_px(corrected, data)
     least_px = LEAST_PX * max(1.0, float(np.median(rig.cameras.image_size_wh[:, 0])) / 1920)
     for _ in range(_UNNAMED):
         likely = _likely(corrected, data)
@@ -100,8 +101,10 @@ def find_fault(rig: Rig, data: WeightedPoints) -> FoundFault | None:
             same = [one for one in likely if one.hypothesis.camera == fault.best.hypothesis.camera]
             # The kind may be uncertain where the camera is certain: any likely kind of its fault may be visible.
             visible_px = max(_explained_px(corrected, data, one) for one in same)
+            # The table shows the rig as it was read: a fault that it does not show is none.
+            visible_px = min(visible_px, _median(shown_px, fault.best))
             # A fault of all lenses mostly moves the points.
-            visible = fault.best.hypothesis.camera < 0 or visible_px > _VISIBLE * fault.shift_px
+            visible = fault.best.hypothesis.kind == "focal lengths" or visible_px > _VISIBLE * fault.shift_px
             return fault if visible else None
         # A small error that explains the sightings as well as the best fault does is corrected first.
         corrected = corrected.by(small[0].step)

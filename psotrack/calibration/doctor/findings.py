@@ -21,6 +21,7 @@ _PLACE_ANEW = (
     "place it anew with `psotrack calibrate rig --pairs`, or all cameras with `psotrack calibrate rig`"
 )
 _LENS_ANEW = "calibrate its lens anew with `psotrack calibrate rig`"
+_RIG_ANEW = "place all cameras anew with `psotrack calibrate rig`"
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,32 @@ class Finding:
         return f"{self.message}; {self.remedy}"
 
 
+def describe_disagreement(
+    explained: float, count: int, viewpoints: int, off_std: float = 0.0, name: str = ""
+) -> Finding:
+    """Describe a rig whose cameras disagree by more than the errors of boxes, without a fault that explains it.
+
+    Args:
+        explained: share of the sightings on which enough viewpoints agree.
+        count: number of sightings.
+        viewpoints: number of viewpoints that are enough.
+        off_std: median distance of the worst camera's sightings from where the others put the bodies, standard
+            deviations of boxes.
+        name: name of this camera; empty where it is not known.
+    """
+    worst = f", and camera {name} is off by {off_std:.1f} times the error of its boxes" if name else ""
+    message = (
+        f"the rig or the detections: {'three' if viewpoints > 2 else 'two'} viewpoints agree on {explained:.0%} of "
+        f"{count} detections{worst}; no single fault and no other reading of the rig explains it"
+    )
+    # Blobs can be other parts of a body in each camera, if the body hardly moves: then the soundest rig disagrees.
+    remedy = (
+        "look whether the detections are of the same bodies in all cameras, and videos of this rig; "
+        "if they are, calibrate it anew"
+    )
+    return Finding("no agreement", (), message, remedy)
+
+
 def describe_gross_fault(explained: float, name: str) -> Finding:
     """Describe a camera that explains hardly any of the points that the others see."""
     message = (
@@ -66,7 +93,8 @@ def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
         several = "; or ".join(f"{_who(rig, one)}: {_of_judged(rig, one, fps)[0]}" for one in every)
         message = f"the cameras disagree, and these faults explain it about equally well: {several}"
         return Finding("unclear", names, message, "none is certain: check these cameras, or use more cameras")
-    numbers = f", which moves its boxes by {fault.shift_px:.0f} px" if names else ""
+    of_lenses = fault.best.hypothesis.kind == "focal lengths"
+    numbers = "" if of_lenses else f", which moves its boxes by {fault.shift_px:.0f} px"
     if also:
         numbers += f"; nearly as likely, {' or '.join(said for said, _ in also)}"
     kind, *others = (_named(one.hypothesis.kind) for one in every)
@@ -89,6 +117,9 @@ def _of_judged(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
     # A fault of all lenses is the same factor for each camera.
     kind, camera = judged.hypothesis.kind, max(judged.hypothesis.camera, 0)
     after = Corrected(rig, np.zeros(len(rig))).by(judged.step)
+    if kind == "several":
+        worst_deg = np.max(_turned_deg(rig.cameras, after.rig.cameras))
+        return f"its cameras are turned or moved, by up to {worst_deg:.1f} degrees", _RIG_ANEW
     late_s = float(after.lag_frames[camera]) / fps
     std = judged.std[judged.hypothesis.columns[0]] / (fps if kind == "clock" else 1)
     return _in_words(kind, rig.cameras[camera], after.rig.cameras[camera], late_s, std)
@@ -114,12 +145,17 @@ def _in_words(
         )
     if kind == "focal length":
         return f"its focal length is {how}", f"try {after.K[0, 0]:.0f} px, or {_LENS_ANEW}"
-    turn = Rotation.from_matrix(after.T_cam_world[:3, :3] @ before.T_cam_world[:3, :3].T)
     way_m = float(np.linalg.norm(after.centre_world - before.centre_world))
-    parts = [f"turned by {np.rad2deg(turn.magnitude()):.1f} degrees"] if "turned" in kind else []
+    parts = [f"turned by {_turned_deg(before, after):.1f} degrees"] if "turned" in kind else []
     parts += [f"moved by {100 * way_m:.0f} cm"] if "moved" in kind else []
     centre = ", ".join(f"{value:.2f}" for value in after.centre_world)
     return f"it is {' and '.join(parts)}", f"{_PLACE_ANEW}; the boxes put it at ({centre}) m"
+
+
+def _turned_deg(before: Camera, after: Camera) -> Float[np.ndarray, "*cameras"]:
+    """Angles by which cameras are turned, degrees."""
+    R = after.T_cam_world[..., :3, :3] @ before.T_cam_world[..., :3, :3].swapaxes(-1, -2)
+    return np.asarray(np.rad2deg(Rotation.from_matrix(R).magnitude()))
 
 
 def describe_reference(

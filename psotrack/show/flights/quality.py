@@ -78,7 +78,8 @@ def camera_quality(tracks: FlightTracks, recording: Recording) -> DataFrame:
         Columns `camera`; `frames`, fraction of the instants at which the camera has a frame; `in_view`, share of the
         drones' positions that are in its image; `width_px`, median width of the drones' boxes in its image; `noise_px`,
         the noise of the drones' places in its image as the run learned it, root mean square of columns and rows;
-        `left_out`, number of its frames that the run left out. NaN where unknown.
+        `explained`, share of its detections that are near a track; `left_out`, number of its frames that the run left
+        out. NaN where unknown.
     """
     import pandas as pd
 
@@ -89,6 +90,7 @@ def camera_quality(tracks: FlightTracks, recording: Recording) -> DataFrame:
     noise_px = pd.DataFrame(
         [errors.get(name, {}).get("noise_px") or (np.nan, np.nan) for name in names], dtype=float
     )
+    explained = {} if record is None else record.explained.get("cameras", {})
     left_out = {} if record is None else record.left_out
     return pd.DataFrame(
         {
@@ -97,6 +99,7 @@ def camera_quality(tracks: FlightTracks, recording: Recording) -> DataFrame:
             "in_view": widths_px.count() / max(int(tracks.trajectories.seen.sum()), 1),
             "width_px": widths_px.median(),
             "noise_px": np.sqrt(noise_px.pow(2).mean(axis=1)),
+            "explained": pd.Series([explained.get(name) for name in names], dtype=float),
             "left_out": [sum(stop - first for first, stop in left_out.get(name, ())) for name in names],
         }
     )

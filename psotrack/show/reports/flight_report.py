@@ -36,6 +36,7 @@ _CAMERAS = (
     ("drones in view", "in_view", "{:.1%}"),
     ("width of a drone (px)", "width_px", "{:.0f}"),
     ("noise (px)", "noise_px", "{:.2f}"),
+    ("detections near a track", "explained", "{:.0%}"),
     ("left out", "left_out", "{}"),
 )
 

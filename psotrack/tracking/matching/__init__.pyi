@@ -1,5 +1,6 @@
 from .assignment import SEPARATION_M
 from .crossings import Crossings, Expected, Measurement, crossings
+from .explained import are_near
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
 from .matching import Matches, match, wide_bounds
 from .proposals import epipolar_distance
@@ -30,6 +31,7 @@ __all__ = [
     "Matches",
     "Measurement",
     "Sightings",
+    "are_near",
     "by_image",
     "crossings",
     "epipolar_distance",
