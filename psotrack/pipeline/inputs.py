@@ -26,6 +26,7 @@ from psotrack.tracking.births import (
     moving_points,
     start_source,
 )
+from psotrack.tracking.camera_errors import Knock
 from psotrack.tracking.matching import Sightings, from_detections, from_silhouettes
 
 logger = logging.getLogger(__name__)
@@ -148,6 +149,7 @@ class Run:
         detection_keys: digests of the files or silhouettes that the detections come from, by camera.
         read_s: time in which the detections were read, seconds.
         clocks: clocks of the cameras, where they were estimated and corrected; None elsewhere.
+        knocks: knocks of cameras that the recording is without from then on.
     """
 
     recording: Recording
@@ -161,6 +163,7 @@ class Run:
     detection_keys: Mapping[str, str]
     read_s: float
     clocks: CameraClocks | None = None
+    knocks: tuple[Knock, ...] = ()
 
     @property
     def by_swarm(self) -> bool:

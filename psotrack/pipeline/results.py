@@ -195,6 +195,7 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
         "points": result.points,
         "ellipsoid": centre_of_ellipsoids((point["middle_of"] for point in result.points), settings.drones),
+        "knocks": _knocks(run, errors),
         "explained": explained,
         "camera_errors": {} if errors is None else errors.record(recording.rig.names),
         "encounters": [asdict(encounter) for encounter in identities.encounters],
@@ -204,6 +205,20 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         **environment(),
     }
     return TrackedRecording(trajectories, tracks.size_m, identities, record)
+
+
+def _knocks(run: Run, errors: TrackErrors | None) -> list[dict[str, Any]]:
+    """Cameras that were knocked in mid-flight: when, by how much, and whether they are left out from then on."""
+    kept = () if errors is None or errors.knock is None else (errors.knock,)
+    return [
+        {
+            "camera": run.recording.rig.names[knock.camera],
+            "frame": knock.frame,
+            "shift_px": knock.shift_px.tolist(),
+            "left_out": number < len(run.knocks),
+        }
+        for number, knock in enumerate((*run.knocks, *kept))
+    ]
 
 
 def _explained(run: Run, tracks: Tracks) -> dict[str, Any]:

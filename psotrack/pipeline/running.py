@@ -34,6 +34,7 @@ from psotrack.foreground.silhouettes import (
 )
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, warn_of_unknown_clocks, with_clocks
 from psotrack.pipeline.inputs import Run, prepare, usable_for
+from psotrack.pipeline.knocks import without_knocked
 from psotrack.pipeline.parts import (
     MethodInputs,
     Parts,
@@ -176,7 +177,8 @@ def _track(
     parts: Parts,
     report: Report,
 ) -> list[tuple[Run, MethodResult]]:
-    """Each run and the result of its method; where clocks are to be estimated, of a second pass with these clocks."""
+    """Each run and the result of its method; of a second pass where one is needed: with estimated clocks, or without
+    a camera from its knock on."""
 
     @cache
     def at_rate(rate_hz: float | None) -> tuple[Recording, Silhouettes | None, dict[Any, MovingPoints]]:
@@ -191,7 +193,12 @@ def _track(
     results = []
     for run, given in zip(runs, settings, strict=True):
         run, result = _at_speed_of_tracks(run, _result_of(run, by_swarm.get(run), report), report)
-        if given.clocks == "auto" and result.tracks.num_drones:
+        knock = None if result.errors is None else result.errors.knock
+        rest = None if knock is None else without_knocked(run, knock)
+        if knock is not None and rest is not None:
+            ((again, result),) = _track(rest, silhouettes, [given], parts, report)
+            run = replace(again, knocks=(knock, *again.knocks))
+        elif given.clocks == "auto" and result.tracks.num_drones:
             clocks = estimate_clocks(run, result.tracks)
             warn_of_unknown_clocks(clocks, run.recording)
             once = msgspec.structs.replace(given, clocks="given")

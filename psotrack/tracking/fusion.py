@@ -267,4 +267,6 @@ def _with_errors(
                 # Drone -1 has the column of zeros.
                 systematic[name] += weight * np.pad(of_method_m2, [(0, 0), (0, 1), (0, 0), (0, 0)])[:, drones]
     corrected = replace(fused, covariance_m2=fused.covariance_m2 * filtered[..., None, None])
-    return corrected, TrackErrors(cameras, SystematicCovariances(**systematic))
+    knocks = (errors.knock for errors, _ in methods if errors is not None)
+    knock = next((each for each in knocks if each is not None), None)
+    return corrected, TrackErrors(cameras, SystematicCovariances(**systematic), knock)

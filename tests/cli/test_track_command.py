@@ -32,7 +32,7 @@ ERRORS = [
 #: Keys of the record beside the tracks, of every method; the contract promises more, where they have a meaning.
 RECORD = {
     *("rate_hz", "camera_times", "settings", "seed", "versions", "device", "input_keys", "start", "volume"),
-    *("drones", "arrivals", "points", "left_out", "ellipsoid", "explained"),
+    *("drones", "arrivals", "points", "left_out", "ellipsoid", "explained", "knocks"),
     *("camera_errors", "encounters"),
     *("seconds", "real_time_factor", "real_time_factor_running"),
 }

@@ -154,7 +154,10 @@ def test_events_of_the_record_are_shown_at_their_times():
     slow = recording_of(ring_rig(2), times={"c1": FrameTimes(6, 12.5, time_offset_s=0.08)})
     # The second part begins behind the last frame.
     left_out = {"c1": [[4, 6], [6, 9]]}
-    first, second, third = find_events(flight_with({"encounters": [met], "left_out": left_out}, slow))
+    knock = {"camera": "c0", "frame": 7, "left_out": True, "shift_px": [3.0, 4.0]}
+    record = {"encounters": [met], "left_out": left_out, "knocks": [knock]}
+    first, knocked, second, third = find_events(flight_with(record, slow))
+    assert (knocked.frame, knocked.text) == (7, "camera c0 was knocked")
     assert (first.frame, first.text) == (6, "drones 0 and 1 meet at 0.31 m; their labels: swapped")
     np.testing.assert_allclose(first.position_m, tracks_with().position_m[6].mean(axis=0))
     assert second.frame == 10

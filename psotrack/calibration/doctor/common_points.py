@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.geometry import Rig, to_camera, triangulate_linearly, viewpoints
 from psotrack.geometry.estimation import cauchy_weight
+from psotrack.tracking.camera_errors import Knock
 from psotrack.tracking.matching import BORDER_PX, Sightings, are_near, by_image, match
 
 #: Standard deviation of the direction of a camera's rays that a fault may cause, degrees.
@@ -95,6 +96,12 @@ class ExaminedFrames:
         exposures = self.sightings.exposures
         chosen = None if exposures is None else exposures.of_cameras(np.array(index))
         return replace(self, sightings=self.sightings.with_arrays(lambda values: values[:, index], chosen))
+
+    def without(self, knock: Knock) -> ExaminedFrames:
+        """What is seen before a camera was knocked, and by the others then."""
+        kept = np.ones(self.sightings.noise_px.shape, bool)
+        kept[knock.frame :, knock.camera] = False
+        return replace(self, sightings=self.sightings.where(kept))
 
     def matched(
         self, rig: Rig, loose_deg: float = 0.0

@@ -15,7 +15,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames
-from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, medians, misfit_px, weigh
+from psotrack.calibration.doctor.corrections import (
+    Corrected,
+    WeightedPoints,
+    linearise,
+    medians,
+    misfit_px,
+    weigh,
+)
 from psotrack.calibration.doctor.diagnosis import Diagnosis
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.findings import (
@@ -23,10 +30,12 @@ from psotrack.calibration.doctor.findings import (
     describe_disagreement,
     describe_fault,
     describe_gross_fault,
+    describe_knock,
     describe_reference,
 )
 from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
 from psotrack.geometry import Rig, project_visible
+from psotrack.tracking.camera_errors import FittedPlaces, Knock, find_knock
 from psotrack.tracking.matching import (
     NOISE_PX,
     NOISE_SHARE,
@@ -98,7 +107,8 @@ def examine(
         again = seen.explained(better.rig)
         # It must explain at least half of what is missing.
         if again.sum() / total > (1 + share) / 2:
-            who = f"cameras {' and '.join(better.cameras)}" if better.cameras else "the calibration"
+            several = "s" if len(better.cameras) > 1 else ""
+            who = f"camera{several} {' and '.join(better.cameras)}" if better.cameras else "the calibration"
             numbers = (
                 f"(explains {again.sum() / total:.0%} of the detections, not {explained.sum() / total:.0%})"
             )
@@ -111,8 +121,16 @@ def examine(
     if unknown is not None:
         findings.append(unknown)
     else:
+        sound = seen
+        knock = _find_knock(rig, seen, data)
+        if knock is not None:
+            both = rig.names if seen.viewpoints(rig) < 3 else (rig.names[knock.camera],)
+            findings.append(describe_knock(both, knock, fps))
+            sound = seen.without(knock)
+            points = sound.common_points(rig)
+            data = weigh(as_read, points)
         lags = find_lags(rig, data)
-        found, (off_std, name) = _find_faults(rig, seen, data, lags)
+        found, (off_std, name) = _find_faults(rig, sound, data, lags)
         findings += found
         unexplained = off_std > NEAR_STD or not (findings or explained.sum() >= MIN_SHARE * total)
         if unexplained and all(finding.kind != "unclear" for finding in found):
@@ -146,6 +164,22 @@ def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chose
     starts = np.linspace(0, max(num_frames - RUN_FRAMES, 0), runs).astype(int)
     frames = np.unique(starts[:, None] + np.arange(RUN_FRAMES))
     return frames[frames < num_frames]
+
+
+def _find_knock(rig: Rig, seen: ExaminedFrames, data: WeightedPoints) -> Knock | None:
+    """A camera that was knocked in mid-flight: in the examined frames, then in all frames between the runs there."""
+
+    def knock_in(data: WeightedPoints) -> Knock | None:
+        slopes = linearise(Corrected(rig, np.zeros(len(rig))), data.points, data.position_m)
+        residual_px, is_used = np.nan_to_num(slopes.residual_px), data.used
+        return find_knock([(FittedPlaces(residual_px, slopes.by_point, is_used), data.points.frame)])
+
+    knock = knock_in(data)
+    if knock is None:
+        return None
+    last = seen.frames[seen.frames < knock.frame].max(initial=0)
+    closer = replace(seen, frames=np.union1d(seen.frames, np.arange(last, knock.frame)))
+    return knock_in(weigh(Corrected(rig, np.zeros(len(rig))), closer.common_points(rig))) or knock
 
 
 def _find_faults(

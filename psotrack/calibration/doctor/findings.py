@@ -12,6 +12,7 @@ from psotrack.calibration.doctor.corrections import Corrected
 from psotrack.calibration.doctor.evidence import Judged
 from psotrack.calibration.doctor.fault_search import FoundFault
 from psotrack.geometry import Camera, Rig
+from psotrack.tracking.camera_errors import Knock
 
 #: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to
 #: 0.15 m.
@@ -72,11 +73,20 @@ def describe_disagreement(
     return Finding("no agreement", (), message, remedy)
 
 
+def describe_knock(names: tuple[str, ...], knock: Knock, fps: float) -> Finding:
+    """Describe a camera, or one of two, that was knocked in mid-flight."""
+    message = (
+        f"camera {' or '.join(names)}: it was knocked at frame {knock.frame} ({knock.frame / fps:.2f} s), which moves "
+        f"its boxes by {np.linalg.norm(knock.shift_px):.0f} px from then on"
+    )
+    return Finding("knocked", names, message, f"before the next flight, {_PLACE_ANEW}")
+
+
 def describe_gross_fault(explained: float, name: str) -> Finding:
     """Describe a camera that explains hardly any of the points that the others see."""
     message = (
         f"camera {name}: it has detections near {explained:.0%} of the drones that the others see: it was turned or "
-        "moved far, has another lens, or its video is of another time"
+        "moved far, or has another lens, or its video is upside down or of another time"
     )
     remedy = f"look at its video beside the others; leave {name} out with --cameras, or {_PLACE_ANEW}"
     return Finding("disagrees", (name,), message, remedy)

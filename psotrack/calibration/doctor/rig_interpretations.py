@@ -44,7 +44,7 @@ def find_best_interpretation(rig: Rig, seen: ExaminedFrames) -> RigInterpretatio
     def explained(interpretation: RigInterpretation, step: int = 1) -> int:
         return int(replace(seen, frames=seen.frames[::step]).explained(interpretation.rig).sum())
 
-    every = [*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)]
+    every = [*_conventions(rig), *_turned_over(rig), *_exchanges(rig), *_lenses(rig, _SCALES)]
     kept = sorted(every, key=lambda each: explained(each, _FEW))[-_KEPT:]
     best = max(kept, key=explained)
     if best.kind == "focal lengths":
@@ -58,7 +58,8 @@ def _conventions(rig: Rig) -> Iterator[RigInterpretation]:
     T = rig.cameras.T_cam_world
     for centred, turned, signs in product((False, True), (False, True), product((1.0, -1.0), repeat=3)):
         flip = np.array(signs)
-        if not (centred or turned or (flip < 0).any()):
+        # Pictures that are upside down are an interpretation of their own.
+        if not centred and not turned and signs in ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0)):
             continue
         R = T[:, :3, :3].swapaxes(-1, -2) if turned else T[:, :3, :3]
         t_m = -np.matvec(R, T[:, :3, 3]) if centred else T[:, :3, 3]
@@ -96,6 +97,27 @@ def _convention(
         "mirrored axes" if (flip < 0).any() else "translation or centre" if centred else "rotation inverted"
     )
     return RigInterpretation(kind, "; ".join(words), "; ".join(remedies), (), Rig(rig.names, cameras))
+
+
+def _turned_over(rig: Rig) -> Iterator[RigInterpretation]:
+    """Interpretations in which the pictures of all cameras, or of one, are turned by 180 degrees."""
+    cameras = rig.cameras
+    is_pinhole = np.ones(len(rig), bool) if cameras.fisheye is None else ~np.asarray(cameras.fisheye)
+    alone = zip(((name,) for name in rig.names), np.eye(len(rig), dtype=bool), strict=True)
+    for names, which in [((), np.ones(len(rig), bool)), *alone]:
+        T, K, dist = cameras.T_cam_world.copy(), cameras.K.copy(), np.array(cameras.dist)
+        T[which, :2] *= -1
+        K[which, :2, 2] = (cameras.image_size_wh - 1)[which] - K[which, :2, 2]
+        # Of OpenCV's coefficients, those of tangential distortion, thin prisms and a tilt have a direction.
+        dist[which & is_pinhole, 2:4] *= -1
+        dist[which & is_pinhole, 8:] *= -1
+        yield RigInterpretation(
+            "upside down",
+            "the pictures are turned by 180 degrees against the rig",
+            "turn the pictures back, or calibrate with pictures as they are now",
+            names,
+            Rig(rig.names, replace(cameras, T_cam_world=T, K=K, dist=dist)),
+        )
 
 
 def _exchanges(rig: Rig) -> Iterator[RigInterpretation]:

@@ -116,6 +116,9 @@ def _of_record(tracks: FlightTracks, recording: Recording | None) -> Iterator[Ev
         together = [drone for drone, name in enumerate(trajectories.drones) if name in names]
         between_m = trajectories.position_m[row, together].mean(axis=0) if together else _NOWHERE_M
         yield _event(tracks, row, EventKind.MET, names, text, between_m)
+    for knock in tracks.record.knocks:
+        row = min(int(np.searchsorted(trajectories.frame, knock["frame"])), trajectories.num_frames - 1)
+        yield _event(tracks, row, EventKind.LEFT_OUT, (), f"camera {knock['camera']} was knocked")
     for camera, left_out in tracks.record.left_out.items():
         for first, stop in left_out:
             row = min(_row_of_frame(tracks, recording, camera, first), trajectories.num_frames - 1)

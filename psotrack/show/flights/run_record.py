@@ -46,6 +46,7 @@ class RunRecord(msgspec.Struct, frozen=True):
         encounters: drones that met.
         left_out: by camera, intervals of frames in which the camera counts as seeing nothing.
         camera_errors: what the cameras show of their errors.
+        knocks: cameras that were knocked in mid-flight.
         explained: share of the detections that tracks explain, of all cameras and of each.
         settings: settings of the run.
         versions: versions of the packages.
@@ -61,6 +62,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     encounters: tuple[MeetingRecord, ...] = ()
     left_out: dict[str, list[tuple[int, int]]] = {}
     camera_errors: dict[str, Any] = {}
+    knocks: tuple[dict[str, Any], ...] = ()
     explained: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     versions: dict[str, str] = {}

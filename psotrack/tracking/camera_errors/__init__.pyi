@@ -7,6 +7,7 @@ from .covariances import (
     noise_ratios,
     systematic_covariances,
 )
+from .knocks import Knock, find_knock
 from .learning import Autocorrelation, CameraErrors, autocorrelation_of, learn_camera_errors
 from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
@@ -18,12 +19,14 @@ __all__ = [
     "CameraViews",
     "ConstantErrors",
     "FittedPlaces",
+    "Knock",
     "MeasurementErrors",
     "SystematicCovariances",
     "TrackErrors",
     "autocorrelation_of",
     "camera_variances",
     "filtered_variances",
+    "find_knock",
     "fit_constant_errors",
     "learn_camera_errors",
     "noise_covariance",

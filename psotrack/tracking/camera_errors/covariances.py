@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float
 from scipy.linalg import solve_discrete_are
 
 from psotrack.settings import ErrorSettings, MotionSettings
+from psotrack.tracking.camera_errors.knocks import Knock
 from psotrack.tracking.camera_errors.learning import CameraErrors
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.tracking.motion import white_jerk_noise
@@ -62,7 +63,7 @@ class SystematicCovariances:
 
 
 def systematic_covariances(
-    views: CameraViews, errors: CameraErrors, given: ErrorSettings = NO_ERRORS
+    views: CameraViews, errors: CameraErrors, given: ErrorSettings = NO_ERRORS, knock: Knock | None = None
 ) -> SystematicCovariances:
     """Covariances of the positions by systematic errors of the cameras.
 
@@ -73,16 +74,22 @@ def systematic_covariances(
         views: the views of all drones.
         errors: the cameras' errors.
         given: smallest errors that the settings state.
+        knock: a camera that shows everything elsewhere from some frame on; None: no camera.
     """
     bias_px2 = np.maximum(np.square(errors.bias_px), given.pixel_px**2)
     constant = errors.constant_covariance.copy()
     of_turns = np.arange(len(constant)) % 4 < 3
     given_rad2 = float(np.radians(given.rig_deg)) ** 2 / 3
     constant[of_turns, of_turns] += max(0.0, given_rad2 - float(np.diag(constant)[of_turns].mean()))
-    mean, parts = _mean_turned(views), []
+    mean, parts, first = _mean_turned(views), [], 0
     for part in views.parts():
         gain = part.gain
         by_place, turned = _moved_by_places(gain, bias_px2), gain @ part.turn_px
+        if knock is not None:
+            after = np.arange(first, first + len(gain)) >= knock.frame
+            moved_m = after[:, None, None] * (gain[:, :, knock.camera] @ knock.shift_px)
+            by_place = by_place + moved_m[..., :, None] * moved_m[..., None, :]
+        first += len(gain)
         late = -np.einsum("fdcik,fdck->fdci", gain, part.flow_px_s)[..., None]
         totals_m2 = []
         for offset in (0.0, mean):

@@ -21,11 +21,7 @@ from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
 from psotrack.tracking.camera_errors.constant_errors import fit_constant_errors, student_inflation
-from psotrack.tracking.camera_errors.variance_components import (
-    FittedPlaces,
-    camera_variances,
-    weighted_residuals,
-)
+from psotrack.tracking.camera_errors.variance_components import camera_variances, weighted_residuals
 from psotrack.tracking.camera_errors.views import CameraViews
 
 #: Correlated errors with a time constant below this, seconds, are noise; slower ones are a bias.
@@ -154,7 +150,7 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: tuple[float, floa
     """
     num_cameras, dt_s = views.num_cameras, 1 / fps
     duration_s = len(views.shown) * dt_s
-    found = np.concatenate([_rows(part).determined for part in views.parts()])
+    found = np.concatenate([part.places.determined for part in views.parts()])
     found = found.reshape(views.shown.shape[:2])
     num_rows = int(found.sum())
     step = max(1, min(round(_STEP_S * fps), num_rows // _MIN_ROWS), -(-num_rows // _MAX_ROWS))
@@ -163,7 +159,7 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: tuple[float, floa
         unknown = np.zeros((4 * num_cameras, 4 * num_cameras))
         return CameraErrors(none * np.nan, *usual, none, 0.0, 0.0, unknown)
     sample = views[::step]
-    rows = _rows(sample)
+    rows = sample.places
     which = np.flatnonzero(rows.determined)
     linear = (
         rows.only(which),
@@ -177,7 +173,7 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: tuple[float, floa
     for _ in range(_ROUNDS):
         rest = _without(views, turn_rad, clock_s)
         inflation, before_px2 = correlation.inflation(step * dt_s, duration_s), total_px2
-        total_px2 = camera_variances(_rows(rest[::step]), inflation, before_px2)
+        total_px2 = camera_variances(rest[::step].places, inflation, before_px2)
         total_px2 = np.where(np.isnan(total_px2), np.nanmean(total_px2), total_px2)
         correlation = autocorrelation_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, correlation)
         inflation = correlation.inflation(step * dt_s, duration_s)
@@ -199,16 +195,6 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: tuple[float, floa
     )
 
 
-def _rows(views: CameraViews) -> FittedPlaces:
-    """The views of all frames and drones, as rows."""
-    cameras = views.num_cameras
-    return FittedPlaces(
-        np.nan_to_num(views.residual_px).reshape(-1, cameras, 2),
-        views.jacobian.reshape(-1, cameras, 2, 3),
-        views.shown.reshape(-1, cameras),
-    )
-
-
 def _without(
     views: CameraViews, turn_rad: Float[np.ndarray, "cameras 3"], clock_s: Float[np.ndarray, "cameras"]
 ) -> CameraViews:
@@ -217,7 +203,7 @@ def _without(
     for part in views.parts():
         turned_px = np.einsum("fdcip,cp->fdci", part.turn_px, turn_rad)
         late_px = -part.flow_px_s * clock_s[:, None]
-        rows = _rows(replace(part, residual_px=part.residual_px - turned_px - late_px))
+        rows = replace(part, residual_px=part.residual_px - turned_px - late_px).places
         determined = rows.determined
         fitted_px = np.where(rows.shown[..., None], rows.residual_px, np.nan)
         weight = np.repeat(rows.shown[determined][..., None].astype(float), 2, axis=-1)

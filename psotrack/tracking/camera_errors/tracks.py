@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,9 @@ from psotrack.tracking.camera_errors.covariances import (
     noise_ratios,
     systematic_covariances,
 )
+from psotrack.tracking.camera_errors.knocks import Knock, find_knock
 from psotrack.tracking.camera_errors.learning import CameraErrors, learn_camera_errors
+from psotrack.tracking.camera_errors.variance_components import FittedPlaces
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.trajectories import Status, Tracks, Trajectories
 
@@ -32,10 +34,12 @@ class TrackErrors:
     Attributes:
         cameras: errors of the cameras.
         systematic: covariances of the positions by systematic errors, which the tracks' covariances do not contain.
+        knock: a camera that was knocked during the recording, which they do contain; None for no camera.
     """
 
     cameras: CameraErrors
     systematic: SystematicCovariances
+    knock: Knock | None = None
 
     def smoothing(self, motion: MotionSettings) -> MotionSettings:
         """Settings of the motion model with noise that fades as it was found to."""
@@ -107,4 +111,14 @@ def with_camera_errors(
         measured_covariance_m2=measured_m2 * measured[..., None, None],
         covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    return corrected, TrackErrors(errors, systematic_covariances(views, errors, given))
+    knock = find_knock(_places_of_frames(views))
+    return corrected, TrackErrors(errors, systematic_covariances(views, errors, given, knock), knock)
+
+
+def _places_of_frames(views: CameraViews) -> Iterator[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]:
+    """The views as rows, and the frame of each row, of some frames after the other."""
+    first = 0
+    for part in views.parts():
+        num_frames, num_drones = part.position_m.shape[:2]
+        yield part.places, np.repeat(np.arange(first, first + num_frames), num_drones)
+        first += num_frames

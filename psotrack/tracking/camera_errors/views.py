@@ -18,6 +18,7 @@ from psotrack.geometry import (
     project_with_jacobian,
     to_camera,
 )
+from psotrack.tracking.camera_errors.variance_components import FittedPlaces
 
 #: Number of frames that are computed at once: those of all frames would take gigabytes for a long recording.
 _FRAMES_AT_ONCE = 1000
@@ -69,6 +70,16 @@ class CameraViews:
     def shown(self) -> Bool[np.ndarray, "frames drones cameras"]:
         """(frames, drones, cameras), whether the camera shows the place of the drone."""
         return np.asarray(np.isfinite(self.residual_px).all(axis=-1) & (self.weight > 0).all(axis=-1))
+
+    @property
+    def places(self) -> FittedPlaces:
+        """The views of all frames and drones, as rows."""
+        cameras = self.num_cameras
+        return FittedPlaces(
+            np.nan_to_num(self.residual_px).reshape(-1, cameras, 2),
+            self.jacobian.reshape(-1, cameras, 2, 3),
+            self.shown.reshape(-1, cameras),
+        )
 
     @property
     def flow_px_s(self) -> Float[np.ndarray, "frames drones cameras 2"]:

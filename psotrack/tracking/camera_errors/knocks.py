@@ -1,0 +1,149 @@
+"""A camera that is knocked in mid-flight: from one frame on it shows everything elsewhere.
+
+Each camera's places are compared with where the other cameras put the body. A knock is a step between two frames that
+stays to the end, and that windows of some frames on both sides show as large as long ones do. How large a step has to
+be, the recording itself shows: errors that change with the attitude and the place of a body make differences between
+neighbouring windows everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.tracking.camera_errors.variance_components import FittedPlaces
+
+#: Numbers of frames of the windows that are compared.
+_WINDOWS = (10, 20, 40, 80)
+#: A step has this many times the length that a difference between neighbouring windows usually has.
+_CLEAR = 6.0
+#: Least part of a step that the shortest window shows, and the means of all frames before and after.
+_STAYS = 0.5
+#: Smallest step, pixels of an image of 1920 columns: a calibration's own error.
+_LEAST_PX = 1.5
+#: Median of a squared length of two components of variance 1 (χ² distribution).
+_CHI2_MEDIAN = 1.386
+
+
+@dataclass(frozen=True)
+class Knock:
+    """A camera that was turned or moved during the recording.
+
+    Attributes:
+        frame: first frame after the knock.
+        camera: index of the camera.
+        shift_px: (2,), by how much the camera's places are moved from then on, pixels.
+        clear: how many times as large as differences between neighbouring windows usually are.
+    """
+
+    frame: int
+    camera: int
+    shift_px: Float[np.ndarray, "2"]
+    clear: float
+
+
+def find_knock(parts: Iterable[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]) -> Knock | None:
+    """The clearest knock of a camera; None if there is none.
+
+    A knock of one camera shows in the others, too, and most clearly in itself. Of two cameras nothing tells which it
+    is: it may be the other one.
+
+    Args:
+        parts: residuals and derivatives of some frames after the other, and (rows,) the number of each row's frame.
+    """
+    told = [_of_cameras(places.only(places.determined), frame[places.determined]) for places, frame in parts]
+    found: list[Knock] = []
+    for camera, of_parts in enumerate(zip(*told, strict=True)):
+        frames, equations = (np.concatenate(each) for each in zip(*of_parts, strict=True))
+        found += _steps(camera, frames, equations)
+    return max(found, key=lambda knock: knock.clear, default=None)
+
+
+def _of_cameras(
+    places: FittedPlaces, frame: Int[np.ndarray, "rows"]
+) -> list[tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"]]]:
+    return [_against_others(places, frame, camera) for camera in range(places.shown.shape[1])]
+
+
+def _against_others(
+    places: FittedPlaces, frame: Int[np.ndarray, "rows"], camera: int
+) -> tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"]]:
+    """Frames in which a camera shows something, and what they tell of a shift of its places: equations [left | right].
+
+    The positions are eliminated: the left side is the part of the unit matrix that no position explains.
+    """
+    rows = np.flatnonzero(places.shown[:, camera])
+    used = places.only(rows)
+    weight = used.shown.astype(float)
+    normal = np.einsum("rc,rcik,rcil->rkl", weight, used.jacobian, used.jacobian)
+    right = np.einsum("rc,rcik,rci->rk", weight, used.jacobian, used.residual_px)
+    J = used.jacobian[:, camera]
+    solved = J @ np.linalg.inv(normal)
+    left = np.eye(2) - solved @ J.swapaxes(-1, -2)
+    rest_px = used.residual_px[:, camera] - np.matvec(solved, right)
+    frames, number = np.unique(frame[rows], return_inverse=True)
+    equations = np.zeros((len(frames), 2, 3))
+    np.add.at(equations, number, np.concatenate([left, rest_px[..., None]], axis=-1))
+    return frames, equations
+
+
+def _steps(
+    camera: int, frames: Int[np.ndarray, "frames"], equations: Float[np.ndarray, "frames 2 3"]
+) -> Iterator[Knock]:
+    """The clearest step of a camera, by each length of the windows, if it is one."""
+    total = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(equations, axis=0)])
+    for window in _WINDOWS:
+        if len(frames) < 6 * window:
+            break
+        first = np.arange(window, len(frames) - window + 1)
+        change_px, clear = _change(total[first] - total[first - window], total[first + window] - total[first])
+        usual = np.sqrt(np.median(clear) / _CHI2_MEDIAN)
+        best = int(clear.argmax())
+        at = first[best]
+        shortest = total[at] - total[at - _WINDOWS[0] // 2], total[at + _WINDOWS[0] // 2] - total[at]
+        stays = [
+            _change(*each)[0] @ change_px[best] for each in (shortest, (total[at], total[-1] - total[at]))
+        ]
+        length2 = float(change_px[best] @ change_px[best])
+        clearly = float(np.sqrt(clear[best])) / max(float(usual), np.finfo(float).tiny)
+        if clearly > _CLEAR and length2 > _LEAST_PX**2 and min(stays) > _STAYS * length2:
+            levels_px = [
+                _solved(each)[0] for each in (total[at] - total[at - window], total[at + window] - total[at])
+            ]
+            at = at - window + _likeliest_split(equations[at - window : at + window], *levels_px)
+            yield Knock(int(frames[at]), camera, change_px[best], clearly)
+
+
+def _likeliest_split(
+    equations: Float[np.ndarray, "frames 2 3"],
+    before_px: Float[np.ndarray, "2"],
+    after_px: Float[np.ndarray, "2"],
+) -> int:
+    """Number of frames before a step, from the shifts before and after it."""
+    costs = [
+        np.einsum("fij,i,j->f", equations[..., :2], px, px) - 2 * equations[..., 2] @ px
+        for px in (before_px, after_px)
+    ]
+    # A step comes after a frame at least, and before one.
+    return 1 + int(np.cumsum(costs[0] - costs[1])[:-1].argmin())
+
+
+def _change(
+    before: Float[np.ndarray, "*steps 2 3"], after: Float[np.ndarray, "*steps 2 3"]
+) -> tuple[Float[np.ndarray, "*steps 2"], Float[np.ndarray, "*steps"]]:
+    """How far apart two shifts are, pixels, and the squared distance by what the equations tell of it."""
+    (first_px, first), (second_px, second) = (_solved(each) for each in (before, after))
+    change_px = second_px - first_px
+    return change_px, np.vecdot(change_px, np.linalg.solve(first + second, change_px[..., None])[..., 0])
+
+
+def _solved(
+    equations: Float[np.ndarray, "*steps 2 3"],
+) -> tuple[Float[np.ndarray, "*steps 2"], Float[np.ndarray, "*steps 2 2"]]:
+    """The shift, and its covariance for a noise of one pixel."""
+    # Two cameras tell a shift along one line only.
+    inverse = np.linalg.inv(equations[..., :2] + 1e-3 * np.eye(2))
+    return np.matvec(inverse, equations[..., 2]), inverse
