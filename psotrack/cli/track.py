@@ -148,7 +148,7 @@ def track(
         std = "" if clock["offset_std_s"] is None else f" ± {1e3 * clock['offset_std_s']:.1f}"
         output.say(f"clock of camera {name}: corrected by {1e3 * clock['offset_s']:+.1f}{std} ms")
         for lost in clock.get("lost_frames", []):
-            frames = "1 frame is" if lost["count"] == 1 else f"{lost['count']} frames are"
+            loss = "1 frame is" if lost["count"] == 1 else f"{lost['count']} frames are"
             output.say(
-                f"clock of camera {name}: {frames} lost before frame {lost['before_frame']}, and accounted for"
+                f"clock of camera {name}: {loss} lost before frame {lost['before_frame']}, and accounted for"
             )

@@ -93,7 +93,7 @@ _CALIBRATIONS = {
     "rig.toml": _calibration("rig.toml/rig.toml"),
     "opencv-yaml": _calibration("opencv-yaml/rig.yml"),
     "caliscope": _calibration("caliscope/camera_array.toml"),
-    "anipose": _calibration("anipose/calibration.toml"),
+    "anipose": _calibration("anipose/calibration.toml", "--size 320,240"),
     "dpjait-cameras": _calibration("dpjait-cameras/cameras.csv"),
     "opencv-json": _calibration("opencv-json/rig.json", "--units m"),
     "opencv-stereo-yaml": _calibration("opencv-stereo/extrinsics.yml", "--units m"),
