@@ -334,9 +334,6 @@ BAD = {
     ("cam1_a.avi cam1_b.avi", "cam1"): (
         "cam1_b.avi: expected one video of camera cam1, found cam1_a.avi as well; say",
     ),
-    ("take_a_b.avi", "a b"): (
-        "take_a_b.avi: expected the name of one camera, found a and b in its name; say whose",
-    ),
     ("videos/left.avi videos/right.avi", "left"): (
         "for the videos in videos: psotrack init",
         "flight/videos --calibration",

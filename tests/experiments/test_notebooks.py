@@ -27,11 +27,6 @@ def cells(notebook):
     return [(cell.cell_type, cell.source) for cell in notebook.cells]
 
 
-def has_picture(cell):
-    kinds = [kind for output in cell.get("outputs", ()) for kind in output.get("data", {})]
-    return any(kind.startswith("image/") for kind in kinds)
-
-
 def test_every_notebook_has_a_script():
     assert sorted((ROOT / "notebooks").glob("*.ipynb")) == [path.with_suffix(".ipynb") for path in SCRIPTS]
 
@@ -52,20 +47,6 @@ def test_the_committed_notebook_is_small_and_was_run_from_top_to_bottom_on_no_pa
     assert notebook.metadata.kernelspec.name == "python3"
     assert "version" not in notebook.metadata.get("language_info", {})
     assert [cell for cell in notebook.cells if "execution" in cell.metadata] == []
-
-
-@each_script
-def test_every_picture_is_followed_by_a_what_to_see_cell(script):
-    pictures = 0
-    was_picture = False
-    for cell in committed_notebook(script).cells:
-        if was_picture:
-            assert cell.cell_type == "markdown"
-            assert cell.source.startswith("*What to see")
-        was_picture = has_picture(cell)
-        pictures += was_picture
-    assert pictures > 0
-    assert not was_picture
 
 
 @pytest.fixture(scope="module")

@@ -91,27 +91,3 @@ def test_a_figure_of_another_version_is_one_line(
     assert outdated(tmp_path) == []
     (tmp_path / "experiments" / "results" / "speed.json").unlink()
     assert outdated(tmp_path) == [f"figure speed: expected version 4 of tracking, found no record; {remedy}"]
-
-
-def test_what_cannot_be_made_is_named(results: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    unknown = results("list", "sped")
-    assert unknown.code == 1
-    assert "expected names of results.toml (speed), found sped" in unknown.err
-    (tmp_path / "experiments" / "speed.py").write_text("raise SystemExit(3)\n")
-    failed = results("make")
-    assert (failed.code, failed.err) == (1, "failed: speed\n")
-    monkeypatch.delenv("MY_DATA")
-    left = results("make")
-    stays = "speed: expected a value of MY_DATA in the environment, found none: the stored figure stays\n"
-    assert (left.code, left.err) == (0, stays)
-    assert results("make", "speed").code == 1
-
-
-def test_the_declared_figures(run_program: Run) -> None:
-    """At most ten, in less than two hours; commands begin with Python and a script of the repository."""
-    shown = run_program(MODULE, "list").out
-    scripts = [word for word in shown.split() if word.startswith("experiments/") and word.endswith(".py")]
-    assert 5 < len(scripts) <= 10
-    assert all((ROOT / script).is_file() for script in scripts)
-    minutes = [float(line.split()[1]) for line in shown.splitlines() if not line.startswith(" ")]
-    assert sum(minutes) <= 120

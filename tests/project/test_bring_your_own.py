@@ -13,7 +13,6 @@ from helpers import assert_refused
 from worlds import two_flights
 
 import psotrack as pt
-from psotrack.foreground.detection import DetectorSettings, find_detector
 from psotrack.foreground.silhouettes import ForegroundSettings, find_background
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
@@ -218,10 +217,6 @@ def empty_hall(settings):
     return EmptyHallDetector(EMPTY_HALL, threshold=round(100 * settings.confidence))
 
 
-def broken(settings):
-    return "no detector"
-
-
 #: What an installed package adds; the last function is missing.
 ENTRY_POINTS = f"""
 [psotrack.searches]
@@ -232,7 +227,6 @@ high-dice = {__name__}:high_dice
 hover = {__name__}:hover
 [psotrack.detectors]
 empty-hall = {__name__}:empty_hall
-broken = {__name__}:broken
 [psotrack.backgrounds]
 median = {__name__}:median
 absent = {__name__}:no_such_function
@@ -376,11 +370,6 @@ BAD_NAMES = [
         "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
     ),
     (
-        partial(find_detector, "yolo", DetectorSettings()),
-        "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo",
-    ),
-    (partial(find_detector, "broken", DetectorSettings()), f"detector broken: {FACE}Detector, found an "),
-    (
         partial(find_background, "absent", ForegroundSettings()),
         "background absent: expected test_bring_your_own:no_such_function to be importable, found module ",
     ),
@@ -388,7 +377,6 @@ BAD_NAMES = [
         partial(pt.register_plugin, "searches", "own", print),
         "kind: expected one of search, score, method, background, detector, found 'searches'",
     ),
-    (partial(pt.register_plugin, "search", "own", 1), "make: expected a function, found 1"),
 ]
 
 

@@ -133,20 +133,6 @@ def test_every_command_within_a_sentence_has_its_name_and_its_options() -> None:
         assert unknown_options(re.findall(r"[^\s\[\]|]+", line)) == set(), line
 
 
-@pytest.mark.parametrize(
-    ("line", "what"),
-    [
-        ("psotrack trak flight", "no command trak"),
-        ("psotrack track flight --out tracks.csv --smoth | head", "--smoth"),
-        ("psotrack export tracks.csv", "to is missing"),
-        ("psotrack export tracks.csv --to docx --out tracks.docx", "docx"),
-    ],
-)
-def test_a_wrong_command_is_found(line: str, what: str) -> None:
-    (words,) = commands(line)
-    assert what in str(complaint(words))
-
-
 @pytest.fixture
 def shell(tmp_path: Path) -> Callable[[str, str], str]:
     """Runs a block of a page in the folder, with a cache of its own: what it prints."""

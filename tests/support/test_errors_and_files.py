@@ -113,11 +113,6 @@ BAD = {
     "a file for a folder": (write_text_over, "out.csv/out", "earlier results are unchanged"),
     # Otherwise a user who passes --force and the path of a folder would lose the folder's content.
     "a folder for a file": (write_text_over, "mine", "mine: expected the path of a file, found a folder"),
-    "no digest of a file that is not there": (
-        partial(digest_file, expected="a readable video"),
-        "b",
-        "b: expected a readable video, found No such file",
-    ),
 }
 
 
