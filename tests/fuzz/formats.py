@@ -91,7 +91,7 @@ def _calibration(path: str, words: str = "") -> Format:
 
 _CALIBRATIONS = {
     "rig.toml": _calibration("rig.toml/rig.toml"),
-    "opencv-yaml": _calibration("opencv-yaml/rig.yml"),
+    "opencv-yaml": _calibration("opencv-yaml/rig.yml", "--size 320,240"),
     "caliscope": _calibration("caliscope/camera_array.toml"),
     "anipose": _calibration("anipose/calibration.toml", "--size 320,240"),
     "dpjait-cameras": _calibration("dpjait-cameras/cameras.csv"),
