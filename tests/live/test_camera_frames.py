@@ -18,11 +18,9 @@ from small_sweeps import wait_until
 
 from psotrack.live import (
     CameraRecorder,
-    CameraStream,
     Instant,
     Meeting,
     StreamClock,
-    live_cameras,
     recording_folder,
 )
 from psotrack.recordings import FrameTimes, Recording, VideoEncoder, make_timeline, probe, read_frames
@@ -249,12 +247,6 @@ def laboratory(tmp_path: Path) -> Recording:
         ),
         bounds_m=(-1.0, 1.0, -2.0, 2.0, 0.0, 3.0),
     )
-
-
-def test_cameras_have_the_short_names_of_other_commands(laboratory: Recording) -> None:
-    cameras = live_cameras(laboratory, ["0", "2"], replay=False)
-    assert [camera.name for camera in cameras] == [RIG.names[0], RIG.names[2]]
-    assert cameras[1].source == CameraStream(f"rtsp://camera/{RIG.names[2]}", SIZE_WH)
 
 
 def noise(index: int) -> np.ndarray:

@@ -192,8 +192,6 @@ def test_a_manifest_is_that_of_the_archive(changes, words, tmp_path):
 def test_other_files_are_no_archives(tmp_path):
     path = tmp_path / "a.psotrack"
     assert_not_unpacked(path, "expected an archive of psotrack, found no such file")
-    path.write_bytes(CONTENT[:-100])
-    assert_not_unpacked(path, "expected a whole archive of psotrack, found another file, or one that was cut")
     with zipfile.ZipFile(path, "w") as zipped:
         zipped.writestr("readme.txt", "of another program" * 10)
     assert_not_unpacked(path, "psotrack.json: expected a file to read, found no such file")
@@ -332,17 +330,12 @@ def no_record(folder):
     (folder / "tracks.json").unlink()
 
 
-def empty_record(folder):
-    (folder / "tracks.json").write_text("{}")
-
-
 #: What happens to a folder, and words of the line.
 UNFIT = [
     (swap_silhouettes, "other content of cam1"),
     (partial(replace_text, old="[cameras.cam8]", new="[cameras.other]"), "no camera cam8"),
     (partial(replace_text, old="fps = 25.0", new="fps = 30.0"), "10 frames at 30 Hz"),
     (no_record, "expected the record of the tracks"),
-    (empty_record, "which `track` writes"),
     (drop_last_frame, "tracks.csv: expected 10 frames, as tracks.json says, found 9"),
 ]
 
@@ -396,7 +389,6 @@ def test_the_same_tracks(compare):
     comparison = compare()
     assert comparison.same
     assert comparison.differences == {}
-    assert comparison.sentence("a.psotrack") == "the same tracks as in a.psotrack"
     assert compare(".parquet").same
 
 
@@ -430,8 +422,6 @@ def test_other_tracks_in_words(compare, flight):
     sentence = comparison.sentence("a.psotrack")
     assert "other tracks from frame 7 (0.280 s) on, by at most 5 mm, than in a.psotrack" in sentence
     assert "swarm.particles 20 -> 50" in sentence
-    assert "smooth False -> True" in sentence
-    assert sentence.endswith("-> 0.0.1")
     assert comparison.to_dict()["differences"]["jax"]["now"] == "0.0.1"
 
 
@@ -486,7 +476,6 @@ def test_tracks_are_computed_again_bit_by_bit(run_psotrack, tmp_path_factory, tm
     done = run_psotrack(*track, *options, "--particles", 15, "--iterations", 10, "--quiet")
     assert done.code == 0, done.err
     assert run_psotrack(*pack).code == 0
-    errors = json.loads(run_psotrack("evaluate", tracks, sequence, "--json", "-").out)
     tracks = place.rename(tmp_path / "moved") / "tracks.csv"
 
     again = tmp_path / "again.csv"
@@ -500,6 +489,3 @@ def test_tracks_are_computed_again_bit_by_bit(run_psotrack, tmp_path_factory, tm
     for key in ("sequence", "frames", "cameras", "rate_hz", "input_keys", "volume", "seed"):
         assert now[key] == was[key], key
     assert list((tmp_path / "empty").glob("*/zarr.json")) == [], "the stored silhouettes are used"
-    # The reference of the archive is interpolated at the instants, which changes last digits.
-    shown_again = json.loads(run_psotrack("evaluate", again, archive, "--json", "-").out)
-    assert shown_again["mean_error_m"] == pytest.approx(errors["mean_error_m"], rel=1e-9)

@@ -1,7 +1,5 @@
 """Thirty-two small cameras, tracked from the videos; two commands make the silhouettes of half of the cameras each."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -17,14 +15,10 @@ SCALE, PIXEL_M = 0.25, 0.017
 
 @pytest.mark.nightly
 def test_thirty_two_cameras_are_tracked_from_the_videos(tmp_path, run_psotrack):
-    angles = [2 * math.pi * (index + 0.5) / NUM_CAMERAS for index in range(NUM_CAMERAS)]
-    cameras = [
-        {
-            "position_m": [4.7 * math.cos(angle), 3.7 * math.sin(angle), (2.2, 3.2)[index % 2]],
-            "target_m": [0.0, 0.0, 1.3],
-        }
-        for index, angle in enumerate(angles)
-    ]
+    angle = 2 * np.pi * (np.arange(NUM_CAMERAS) + 0.5) / NUM_CAMERAS
+    height_m = np.resize([2.2, 3.2], NUM_CAMERAS)
+    place_m = np.stack([4.7 * np.cos(angle), 3.7 * np.sin(angle), height_m], axis=-1)
+    cameras = [{"position_m": each, "target_m": [0.0, 0.0, 1.3]} for each in place_m.tolist()]
     recipe = change_scenario(scenario("S02_D4_A"), {"cameras": cameras})
     settings = SimulationSettings(scale=SCALE, num_frames=30, masks=False, onboard=False)
     folder = simulate(recipe, tmp_path, settings)
@@ -44,6 +38,6 @@ def test_thirty_two_cameras_are_tracked_from_the_videos(tmp_path, run_psotrack):
     # What is left when this offset of each drone is removed is noise: a silhouette's border is known to about a pixel,
     # and more than four cameras with independent noise see each drone.
     assert errors["mean_error_m"] < 1.5 * PIXEL_M
-    assert errors["offset_removed_mean_error_m"] < PIXEL_M / math.sqrt(4)
+    assert errors["offset_removed_mean_error_m"] < PIXEL_M / np.sqrt(4)
     # Cameras on all sides: each drone is seen by most of them.
     assert np.median(tracked.trajectories.num_cameras) > NUM_CAMERAS / 2

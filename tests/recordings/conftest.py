@@ -13,7 +13,7 @@ from psotrack.trajectories import Trajectories, write_trajectories
 
 @pytest.fixture
 def sound(tmp_path_factory, tmp_path):
-    """A copy of a sequence of each half of the dataset, and of videos of any rig: wide has twice the rate.
+    """A copy of a sequence of each half of the dataset, and of videos of any rig.
 
     The names of the sequences state other numbers of drones than they have.
     """
@@ -25,7 +25,6 @@ def sound(tmp_path_factory, tmp_path):
         (any_rig / "pictures").mkdir(parents=True)
         for name in ("left", "right"):
             write_video(any_rig / f"{name}.avi", 6)
-        write_video(any_rig / "wide.avi", 11, (96, 48), 50.0)
         (any_rig / "left.zip").write_bytes(b"PK")
         cv2.imwrite(str(any_rig / "ignore.png"), np.zeros((10, 10), np.uint8))
         time_s = np.arange(5.0)

@@ -138,15 +138,6 @@ def test_detections_without_videos_are_tracked(run_psotrack, folder, tmp_path):
     assert json.loads(run_psotrack("evaluate", out, folder, "--json", "-").out)["mean_error_m"] < 0.01
 
 
-class Own:
-    """A method of the caller."""
-
-    reads_detections = True
-
-    def __call__(self, inputs, report=None):
-        raise AssertionError("never called: there are no videos")
-
-
 def test_recordings_without_videos(run_psotrack, folder, tmp_path):
     recording = open_recording(folder)
     assert not recording.videos
@@ -163,9 +154,6 @@ def test_recordings_without_videos(run_psotrack, folder, tmp_path):
     refused(lambda: pt.read_recording(folder, cameras="camera9"), "cameras: expected some of")
     command = ("track", folder, "--out", tmp_path / "tracks.csv", "--quiet")
     refused(lambda: run_psotrack(*command), "expected a video for each of the cameras c0, c1, ", "found none")
-    settings = {"method": "projection-lines"}
-    track = partial(pt.track, folder, settings, method=Own(), cache=tmp_path)
-    refused(track, "expected at least one video")
 
 
 # --- pictures as the video of a camera

@@ -141,7 +141,6 @@ def test_byte_orders_integers_and_reals(tmp_path, processor, scale, analog, capl
         np.testing.assert_allclose(markers.position_m[seen], independent[seen] / 1e3, rtol=1e-12)
 
 
-PROMISED = {"FRAMES": 1149}
 LONG = {"FRAMES": 65535, "LONG_FRAMES": 20.0}
 FIELDS = {"FRAMES": None, "TRIAL__ACTUAL_START_FIELD": (5, 0), "TRIAL__ACTUAL_END_FIELD": (24, 0)}
 
@@ -236,13 +235,6 @@ def test_written_markers_are_read_back_and_by_ezc3d(tmp_path):
     assert np.isnan(independent["data"]["points"][:3, 1, 3]).all()
     assert np.argwhere(independent["data"]["meta_points"]["residuals"][0] < 0).tolist() == [[1, 3]]
     np.testing.assert_allclose(independent["data"]["points"][:3, 2, 4], 1e3 * position_m[4, 2], rtol=1e-6)
-
-
-def test_the_largest_number_of_frames_that_is_written(tmp_path):
-    """The header counts frames in 16 bits: at most 65,535 (11 minutes at 100 Hz). ezc3d silently drops the rest."""
-    path = tmp_path / "a.c3d"
-    write_c3d(path, Markers(("Dron1:1",), np.ones((65_535, 1, 3)), 100.0))
-    assert len(read_c3d(path).position_m) == 65_535
 
 
 # --- bodies in flight

@@ -82,12 +82,6 @@ def test_corrected_times(drawn, offset_s, drift):
 DROPPED = FrameTimes.listed(np.array([0.0, 0.1, 0.2, 0.4, 0.5]))
 #: Name of the case -> times of two cameras, rate of the instants, frames of both, offsets of the second in seconds.
 TIMELINES = {
-    "a late start": (
-        (FrameTimes(4, 10.0), FrameTimes(4, 10.0, 0.23)),
-        None,
-        [[0, -1], [1, -1], [2, 0], [3, 1], [-1, 2], [-1, 3]],
-        [0, 0, *[0.03] * 4],
-    ),
     "a slower camera": (
         (FrameTimes(8, 40.0), FrameTimes(2, 10.0)),
         None,

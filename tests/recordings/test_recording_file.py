@@ -78,7 +78,6 @@ def write_boxes(path, frames):
 
 LEFT = camera("left", 'video = "left.avi"', PLACE)
 RIGHT = camera("right", 'video = "right.avi"', PLACE)
-WIDE = camera("wide", 'video = "wide.avi"', PLACE)
 
 
 def test_the_keys_of_a_camera(folder):
@@ -206,18 +205,6 @@ def test_a_camera_without_a_name_in_the_rig_file_is_named(folder, caplog):
     assert "no place of camera K2 in rig.toml, whose c1 is of no camera of the recording; " in caplog.text
 
 
-def test_a_file_that_states_no_sizes_gets_those_of_the_videos(folder):
-    given = open_recording(write_recording(folder, LEFT, WIDE)).rig
-    # The layout of the dataset has one focal length, and no skew.
-    given.cameras.K[:, 1, 1] = given.cameras.K[:, 0, 0]
-    given.cameras.K[:, 0, 1] = 0.0
-    write_calibration(folder / "cameras.csv", given)
-    videos = (camera("left", 'video = "left.avi"'), camera("wide", 'video = "wide.avi"'))
-    rig = open_recording(write_recording(folder, *videos, top='calibration = "cameras.csv"')).rig
-    np.testing.assert_array_equal(rig.cameras.K, given.cameras.K)
-    assert rig.cameras.image_size_wh.tolist() == [[64, 48], [96, 48]]
-
-
 def test_cameras_without_place_are_left_out(folder, caplog):
     recording = open_recording(write_recording(folder, LEFT, camera("right", 'video = "right.avi"')))
     assert recording.rig.names == ("left",)
@@ -309,7 +296,6 @@ def test_detections_that_all_lie_beyond_the_end_of_the_video(run_psotrack, folde
         "left.csv: expected detections in the frames 0 to 5 of camera left (left.avi), found none before frame 6; ",
         "are they detections in another video?",
     )
-    assert_refused(lambda: run_psotrack("init", "--show", path), *words, unchanged=folder)
     assert_refused(lambda: run_psotrack("doctor", path), *words, unchanged=folder)
 
 
@@ -380,12 +366,10 @@ SEQUENCES = {
                    "cam1i_s.avi: expected one such file per camera, found cam1i.avi as well"),
     "a video of another size": (lambda folder: write_video(folder / S / "cam1i_s.avi", size_wh=(96, 64)),
                                 "cam1i_s.avi: expected images", "principal point (32, 24), found 96 x 64 pixels"),
-    "commas": (edit(CAMERAS, ";", ",", -1), ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
     "feet": (edit(CAMERAS, "cam_x[m]", "cam_x[ft]"),
              ": expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x[ft]"),
     "a column twice": (edit(CAMERAS, "cam_y[m]", "cam_x[m]"), ", line 1: expected each column once, found cam_x again"),
     "five coefficients": (five_coefficients, "4 distortion coefficients, found 5"),
-    "a comma": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;2;0,5"), ", line 3", "found '0,5'; write decimals with a point"),
     "a camera twice": (edit(CAMERAS, "cam2i;2", "cam1i_s;2"),
                        ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
     "focal length 0": (edit(CAMERAS, "1158.3", "0"), "line 3, column focal_length: expected a focal length above 0 "),
@@ -745,6 +729,3 @@ def test_times_since_1970_are_refused_before_memory_is_used_up(sound):
         "when camera right ends; ", " subtract 1700000000.25 s, the time of the first frame of camera left",
     )  # fmt: skip
     assert_refused(lambda: opened()(sound).timeline(), *words, unchanged=sound)
-    toml(LEFT + RIGHT)(sound)
-    words = ("1e+09 Hz until 0.20 s, ", "; check the rates and times")
-    assert_refused(lambda: opened()(sound).timeline(1e9), *words, unchanged=sound)

@@ -127,16 +127,6 @@ def test_a_camera_that_sees_nothing_changes_nothing_for_the_others():
     assert found.record(RIG.names)[RIG.names[1]]["offset_std_s"] is None
 
 
-def test_without_sightings_no_clock_is_known():
-    timeline = make_timeline(alike())
-    shown = sightings_of(alike())
-    nothing = replace(shown, noise_px=np.full_like(shown.noise_px, np.nan))
-    found = clocks_of_tracks(RIG, nothing, timeline, tracked(timeline))
-    assert not found.offset_s.any()
-    assert np.isinf(found.offset_std_s).all()
-    assert not found.is_certain(0.0).any()
-
-
 def test_a_clock_that_runs_fast_is_found():
     """One camera has 25.1 frames per second, but 25 are given."""
     shown = alike(250) | {RIG.names[2]: FrameTimes(250, 25.1)}

@@ -172,7 +172,6 @@ BAD = [
     ("dron2.tum", TUM, read_tum, "at least one line with numbers"),
     ("a.txt", None, lambda path: write_trajectories(path, flight()), "a name that ends in .csv or .parquet"),
     ("tum", None, lambda path: write_tum(path, flight(drones=("a", "a/b", "c"))), "names of files"),
-    ("tum", None, lambda path: write_tum(path, flight(drones=("a", "", "c"))), "names of files"),
     ("", None, lambda _: flight(frame=np.array([0, 1, 1, 2, 3])), "increasing frame numbers"),
     ("", None, lambda _: flight(drones=("a", "b", "a")), "different names"),
     ("", None, lambda _: flight(covariance_m2=SKEW), "trajectories.covariance_m2: expected symmetric matrices"),
