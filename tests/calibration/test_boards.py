@@ -19,7 +19,6 @@ from psotrack.calibration import (
     detect_board,
     find_views,
     instants_of_numbers,
-    lens_of_view,
     open_images,
     open_recorded,
     parse_lens_model,
@@ -28,7 +27,7 @@ from psotrack.calibration import (
 )
 from psotrack.calibration.board_recognition import missing_board, recognise_board
 from psotrack.calibration.rig.lenses import find_lens, fit_boards
-from psotrack.geometry import make_camera, make_rig, project
+from psotrack.geometry import make_camera, make_rig
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings.datasets import open_recording
 
@@ -243,14 +242,6 @@ def test_a_stereo_pair_and_a_chessboard():
 
 
 # The lens of a camera.
-
-
-def test_lenses_of_a_data_sheet():
-    """The dataset's action camera, 92.45 x 60.83 degrees."""
-    lens = lens_of_view(92.45, 60.83, (3840, 2160))
-    edges = np.array([[np.tan(np.deg2rad(92.45 / 2)), 0, 1], [0, -np.tan(np.deg2rad(60.83 / 2)), 1]])
-    # Pixel centres are at whole numbers: the image ends half a pixel after the last pixel's centre.
-    np.testing.assert_allclose(project(lens, edges)[0], [[3839.5, 1079.5], [1919.5, -0.5]], atol=1e-9)
 
 
 def test_a_lens_from_a_board(tmp_path):

@@ -429,10 +429,6 @@ def fit_read_world(path):
     return fit_world(FOUR, read_world(path), with_scale=False)
 
 
-def straight(speed_m_s):
-    return lambda t: np.stack([speed_m_s * np.asarray(t), 0 * t, 1 + 0 * t], axis=-1)
-
-
 # Points before a camera.
 RNG = np.random.default_rng(9)
 K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
@@ -496,7 +492,6 @@ BAD = {
     "a line given": (calls(align, np.eye(4, 3), LINE, with_scale=True), "not on one line, found 4 on a line"),
     # Clocks.
     "hardly moves": (offsets(random_motion(0, 0.01)), "the offset to a frame, 0.04 s, found a"),
-    "hovers": (offsets(straight(0.0)), "if the drones hover"),
     "out of range": (offsets(random_motion(0), max_offset_s=0.3, offset_s=0.9), "end of the range, +0.3 s"),
     "no common time": (offsets(random_motion(0), start_s=60.0), "of both at offsets within 1 s, found none"),
     "back in time": (offsets(random_motion(0), backwards=True), "reference at two increasing times"),

@@ -243,18 +243,6 @@ def test_most_points_give_the_pose_whatever_the_random_numbers_of_opencv_are():
     np.testing.assert_allclose(found[0], T, atol=1e-6)
 
 
-def test_points_that_determine_no_pose_give_none():
-    T, points_m, rays = world(np.random.default_rng(5), 6)
-    line_m = points_m[0] + np.linspace(0, 0.5, 6)[:, None] * np.array([1.0, 0.0, 0.0])
-    of_line = rays_of(T, line_m)
-    for solver in ("sqpnp", "ippe"):
-        assert not len(solve_pnp(points_m[:3], rays[:3], solver))
-        assert not len(solve_pnp(line_m, of_line, solver))
-    assert solve_pnp_ransac(points_m[:3], rays[:3], 1e-3) is None
-    assert solve_pnp_ransac(np.ones((6, 3)), rays, 1e-3) is None
-    assert solve_pnp_ransac(line_m, of_line, 1e-3) is None
-
-
 def test_a_point_that_is_not_seen_does_not_count_wherever_it_is():
     """Found: an unseen corner behind a fisheye camera refused the right pose of a board, by 4.7 px."""
     points_m = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, -1.0]])

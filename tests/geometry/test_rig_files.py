@@ -416,7 +416,6 @@ BAD = {
     "unit": (anipose("adj", 'unit = "ft"\nadj'), "metadata.unit: expected one of m, cm, mm, found"),
     "TOML": (reads("x.toml", "[cam_0\n"), "x.toml, line 1: expected valid TOML"),
     "no camera": (reads("x.toml", ""), "at least one camera, found none"),
-    "JSON": (reads("x.json", "{}"), "camera.matrix or K or camera_matrix: expected 3 x 3 numbers, found no"),
     "YAML": (reads("x.yml", CUT_YAML), "line ", "expected valid YAML or JSON, found an error"),
     "unknown": (reads("x.dat", "1 2"), "x.dat: expected a rig file of a known format, found other content"),
     "size of DLT": (dlt(), "camera cam1", "pass --size"),

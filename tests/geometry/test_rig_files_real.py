@@ -140,13 +140,3 @@ def test_lenses_by_name_in_json():
     for index, one in enumerate(stated.values()):
         np.testing.assert_array_equal(lenses.cameras.K[index], one["K"])
         np.testing.assert_array_equal(lenses.cameras.dist[index], one["dist"])
-
-
-def test_one_lens_in_json():
-    folder = published("wordbomb/PoseFree-GeoLocator")
-    (path,) = folder.glob("UAV experiment/**/cam2_0619.json")
-    lens = read_lenses(path)
-    assert lens.names == ("cam2_0619",)
-    assert lens.cameras.K[0, 0, 0] == 1563.66571
-    assert lens.cameras.dist.shape == (1, 5)
-    assert lens.cameras.image_size_wh.tolist() == [[1920, 1080]]

@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack.inside_out import fuse, read_camera_path, write_camera_path
-from psotrack.recordings.exchange import export_tracks
 from psotrack.trajectories import Status, read_trajectories, write_trajectories
 
 
@@ -332,14 +331,6 @@ def test_files_are_fused_into_tracks_that_other_commands_read(run_fuse, files, t
     assert len(drone["lever_arm_std_m"]) == 3
     assert drone["offset_s"] is None
     assert drone["inside"]["scale"] > 0
-
-
-def test_tracks_may_have_any_format(run_fuse, files, tmp_path) -> None:
-    tracks = tmp_path / "tracks.json"
-    export_tracks(read_trajectories(files / "tracks.csv"), "json", tracks)
-    run_fuse("dron1.csv tracks.csv", "--out", tmp_path / "one.csv")
-    run_fuse("dron1.csv", tracks, "--out", tmp_path / "same.csv")
-    assert (tmp_path / "same.csv").read_bytes() == (tmp_path / "one.csv").read_bytes()
 
 
 def test_options_of_the_point_and_of_the_clock(run_fuse, tmp_path) -> None:

@@ -26,7 +26,6 @@ from marker_worlds import (
 )
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import InputError
 from psotrack.geometry import project, scale_lens
 from psotrack.inside_out import (
     Flag,
@@ -287,15 +286,6 @@ def test_a_stream_that_ends_is_not_interrupted(drawn, monkeypatch):
     assert not found.interrupted
     # Without timestamps, the times of arrival are used.
     assert (np.diff(found.path.time_s) > 0).all()
-
-
-def test_reading_ahead_raises_errors():
-    def broken():
-        yield 1
-        raise InputError("frame 1", expected="an image", found="none")
-
-    with pytest.raises(InputError, match="frame 1"):
-        list(read_ahead(broken()))
 
 
 def test_newest_items_are_used_and_the_last_is_never_left_out():

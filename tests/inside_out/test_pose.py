@@ -271,16 +271,6 @@ def test_too_few_markers_and_markers_that_determine_nothing_give_no_pose():
         assert estimated(view, image_corners(view, places_m), places_m) is None
 
 
-def test_markers_that_all_contradict_one_another_give_no_pose():
-    rng = np.random.default_rng(9)
-    view, corners_m = camera_at(), two_walls(10)
-    square_px = 30 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    for seed in range(5):
-        shuffled = np.random.default_rng(seed).permutation(10)
-        middles_px = rng.uniform((200, 200), (1700, 900), (10, 1, 2))
-        assert estimated(view, middles_px + square_px, corners_m[shuffled]) is None
-
-
 # Second poses.
 
 

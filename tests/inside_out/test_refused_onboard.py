@@ -36,7 +36,6 @@ from psotrack.inside_out import (
     open_source,
     read_camera_path,
     read_marker_map,
-    read_marker_table,
     read_measured_corners,
     smooth,
     write_camera_path,
@@ -70,12 +69,12 @@ def fuses(options):
     return lambda folder, run: partial(run, f"fuse --out {{new}} {options}")
 
 
-def reads(text, read=read_marker_map, name="corners.csv"):
-    """A file of this text is read."""
+def reads(text):
+    """A table of this text is read."""
 
     def prepare(folder, run):
-        (folder / name).write_bytes(text.encode())
-        return partial(read, folder / name)
+        (folder / "corners.csv").write_bytes(text.encode())
+        return partial(read_marker_map, folder / "corners.csv")
 
     return prepare
 
@@ -138,11 +137,8 @@ MIRRORED = wide_table({marker: corners * [1.0, -1.0, 1.0] for marker, corners in
 CORNERS_OF_3 = tuple(f"Marker3:{corner}" for corner in range(1, 5))
 UNSEEN_M = np.ones((5, 4, 3))
 UNSEEN_M[:, 1] = np.nan
-TEN_COLUMNS = "\n".join(line.rsplit(";", 3)[0] for line in WIDE.splitlines())
 NEGATIVE_STD = re.sub("(?m)$", ";-2", WIDE.rstrip()).replace("4[m];-2", "4[m];std[mm]")
 THREE_ROWS = re.sub("\n3,3,.*", "", LONG)
-TRACKS = "frame,time_s,drone,x_m,y_m,z_m\n0,0,a,1,2,3\n"
-CENTRES_TWICE = "id,x_m,y_m,z_m\n3,1,2,0.5\n3,1.5,2,0.5\n"
 
 
 def with_cells(cells):
@@ -174,7 +170,6 @@ BAD = {
     # Tables of markers.
     "empty cell": (with_cells([*CELLS[:5], "", *CELLS[6:]]), "line 4, column y2[m]", "found nothing"),
     "three corners": (with_cells(CELLS[:10]), "line 4: expected 13 values, found 10; "),
-    "no fourth corner": (reads(TEN_COLUMNS), "expected a column x4, found only"),
     "three rows": (reads(THREE_ROWS), "line 10 to 12, marker 3", "found none of number 3; add"),
     "marker twice": (reads(WIDE.replace("\n4;", "\n3;")), "line 5, column id", "once, found 3 again"),
     "corner twice": (reads(LONG.replace("\n3,2,", "\n3,1,")), "line 11", "found corner 1 of marker 3 again"),
@@ -195,7 +190,6 @@ BAD = {
     "mirrored": (reads(MIRRORED), "16 of 16 markers face out of the room", "an axis is mirrored"),
     "not finite": (calls(MarkerMap, {5: np.full((4, 3), np.nan)}), "marker 5: expected finite corners"),
     "no markers": (calls(MarkerMap, {}), "at least one marker"),
-    "centre twice": (reads(CENTRES_TWICE, read_marker_table), "line 3, column id", "once, found 3 again"),
     "unseen corner": (reads_c3d(CORNERS_OF_3, UNSEEN_M), "room.c3d, marker 3: ", "number 2 is never seen"),
     "labels of drones": (reads_c3d(("Dron1:Dron11",), np.ones((5, 1, 3))), "Marker7:1", "found Dron1"),
     # Maps from videos and from centres.
@@ -212,7 +206,6 @@ BAD = {
     "negative variance": (reads_path(cov_zz="-9e8"), "line 2: expected a covariance in cov_xx, "),
     "no covariance": (reads_path(cov_xa="1e9"), "line 2, column cov_xx: ", "in cov_xx to cov_cc"),
     "no time": (reads_path(time_s=""), "line 2: expected a time_s"),
-    "no orientations": (reads(TRACKS, read_camera_path), "orientations"),
     # Poses, their settings, and the filter.
     "no coordinates": (calls(estimate_pose, *NOWHERE, PoseSettings()), "finite coordinates"),
     "min_markers": (calls(PoseSettings, min_markers=0), "min_markers: expected at least 1, found 0"),

@@ -323,11 +323,6 @@ def lens():
     return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(640, 480), dist=(-0.2, 0.05, 0.001, -0.0005))
 
 
-def board(aside_m=0.0):
-    R, _ = look_at((0.3 + aside_m, -3.0, 1.5), (0.1, 0.0, 1.1))
-    return PosedBoard(R.T, np.array([-0.35, 0.0, 1.7]))
-
-
 def grey_image(cam):
     return np.full((cam.height, cam.width, 3), 90, np.uint8)
 
@@ -339,7 +334,9 @@ def board_corners_m(places):
 
 def test_the_board_is_where_opencv_projects_it():
     """Drawn into the images of which the lens's image consists, against `projectPoints` with distortion."""
-    camera, places = lens(), board(aside_m=0.75)
+    camera = lens()
+    R, _ = look_at((1.05, -3.0, 1.5), (0.1, 0.0, 1.1))
+    places = PosedBoard(R.T, np.array([-0.35, 0.0, 1.7]))
     seen = lens_image(camera)
     image = seen.assemble([draw_board(grey_image(cam), cam, places) for cam in seen.faces])
     assert image.shape == (480, 640, 3)
@@ -348,20 +345,6 @@ def test_the_board_is_where_opencv_projects_it():
     points_m = board_corners_m(places)[ids.ravel()]
     expected = opencv_pixels(pinhole(camera), points_m, camera.dist)
     np.testing.assert_allclose(found.reshape(-1, 2), expected, rtol=0, atol=0.2)
-
-
-def test_the_back_of_the_board_shows_nothing_and_a_board_behind_the_camera_is_not_seen():
-    cam, places = pinhole(lens()), board()
-    grey = grey_image(cam)
-    turned = PosedBoard(places.axes * [-1, 1, -1], places.corner_m + places.axes[:, 0])
-    seen = draw_board(grey, cam, turned)
-    assert set(np.unique(seen)) <= set(range(90, 121))
-    assert (seen == 120).sum() > 10_000
-    # A board that reaches beyond the upper edge of the image is drawn as far as it is seen.
-    raised = PosedBoard(places.axes, places.corner_m + np.array([0.0, 0.0, 0.6]))
-    assert (draw_board(grey, cam, raised)[0] != 90).any()
-    behind = PosedBoard(places.axes, np.array([0.0, -9.0, 1.0]))
-    np.testing.assert_array_equal(draw_board(grey, cam, behind), grey)
 
 
 def test_neighbours_see_the_board_together_and_it_is_tilted():

@@ -186,13 +186,7 @@ def test_furniture_stands_inside_the_hall_and_outside_the_flight_volume(hall_nam
         assert np.any((upper < low) | (lower > high)), f"{box} stands in the flight volume"
         if lower[2] == 0:
             continue
-        # A box above the floor lies on another box, such as a table, a crate, a pole or a stage.
-        supports = []
-        for other in hall.boxes:
-            touches = (lower <= other.upper_m) & (upper >= other.lower_m)
-            supports.append(touches[:2].all() and 0 <= lower[2] - other.upper_m[2] <= 0.07)
-        assert any(supports), f"{box} has no support"
-        # It is closed from below.
+        # A box above the floor is closed from below.
         bottom = [lower, [*upper[:2], lower[2]]]
         corners_m = [(face.corners_m.min(axis=0), face.corners_m.max(axis=0)) for face in below]
         assert any(np.allclose(found, bottom) for found in corners_m)
@@ -362,14 +356,12 @@ def test_a_file_is_read_and_its_paths_are_relative_to_its_folder(tmp_path, monke
 def test_change_scenario_changes_only_the_given_fields():
     changes = {
         "imaging.reflections": 0,
-        "surroundings.screen": 0.02,
         "drones[1].flight.terms[0].period_s": 8.0,
         "drones[2].model": {"file": "a.obj"},
         "onboard": None,
     }
     changed = change_scenario(S02, changes)
     assert changed.imaging.reflections == 0.0
-    assert changed.surroundings.screen == 0.02
     assert changed.drones[1].flight.terms[0].period_s == 8.0
     assert changed.drones[2].model == Mesh(file="a.obj")
     assert changed.onboard is None
