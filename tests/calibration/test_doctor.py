@@ -17,7 +17,7 @@ from scipy.stats import multivariate_normal
 import psotrack as pt
 from psotrack.calibration.doctor import evidence, examine
 from psotrack.calibration.doctor.common_points import CommonPoints
-from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, linearise, weigh
+from psotrack.calibration.doctor.corrections import PER_CAMERA, Corrected, WeightedPoints, linearise, weigh
 from psotrack.geometry import Rig
 from psotrack.recordings import Detections
 from psotrack.tracking.matching import from_detections
@@ -347,6 +347,19 @@ def small_problem():
     sound = np.zeros((10, 4)), np.ones((10, 4)), np.ones(4)
     points = CommonPoints(np.arange(10), piece, point_m, velocity_m, centre_px, side_px, *sound)
     return rig, WeightedPoints(points, point_m, weight)
+
+
+def test_derivatives_are_those_of_finite_differences():
+    rig, data = small_problem()
+    at = Corrected(rig, np.array([0.3, 0.0, -1.0, 2.0]))
+    slopes = linearise(at, data.points, data.position_m)
+    for column, step in enumerate(1e-6 * np.eye(PER_CAMERA * 4 + 1)):
+        ahead = linearise(at.by(step), data.points, data.position_m)
+        behind = linearise(at.by(-step), data.points, data.position_m)
+        found = (behind.residual_px - ahead.residual_px) / 2e-6
+        seen = np.isfinite(found)
+        expected = slopes.by_parameter[..., column]
+        np.testing.assert_allclose(found[seen], expected[seen], rtol=1e-4, atol=1e-3)
 
 
 def test_the_evidence_is_that_of_the_dense_normal_distribution():
