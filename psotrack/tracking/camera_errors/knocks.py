@@ -3,7 +3,8 @@
 Each camera's places are compared with where the other cameras put the body. A knock is a step between two frames that
 stays to the end, and that windows of some frames on both sides show as large as long ones do. How large a step has to
 be, the recording itself shows: errors that change with the attitude and the place of a body make differences between
-neighbouring windows everywhere.
+neighbouring windows everywhere. Where another camera begins or ends to see the body, or nobody sees the body for a
+time, the errors of a rig make steps of their own, which are no knocks.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ _WINDOWS = (10, 20, 40, 80)
 _CLEAR = 6.0
 #: Least part of a step that the shortest window shows, and the means of all frames before and after.
 _STAYS = 0.5
+#: Largest change of the share of frames in which another camera sees the body, from one window to the next; largest
+#: length of both windows, in frames of the recording for each frame that the camera shows.
+_OTHERS_CHANGE, _DENSE = 0.2, 2.0
 #: Smallest step, pixels of an image of 1920 columns: a calibration's own error.
 _LEAST_PX = 1.5
 #: Median of a squared length of two components of variance 1 (χ² distribution).
@@ -57,21 +61,22 @@ def find_knock(parts: Iterable[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]) ->
     told = [_of_cameras(places.only(places.determined), frame[places.determined]) for places, frame in parts]
     found: list[Knock] = []
     for camera, of_parts in enumerate(zip(*told, strict=True)):
-        frames, equations = (np.concatenate(each) for each in zip(*of_parts, strict=True))
-        found += _steps(camera, frames, equations)
+        frames, equations, shown = (np.concatenate(each) for each in zip(*of_parts, strict=True))
+        found += _steps(camera, frames, equations, shown)
     return max(found, key=lambda knock: knock.clear, default=None)
 
 
-def _of_cameras(
-    places: FittedPlaces, frame: Int[np.ndarray, "rows"]
-) -> list[tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"]]]:
+#: Frames in which a camera shows something, what they tell of a shift of its places, as equations [left | right], and
+#: the share of the bodies that each camera shows in them.
+_Told = tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"], Float[np.ndarray, "frames cameras"]]
+
+
+def _of_cameras(places: FittedPlaces, frame: Int[np.ndarray, "rows"]) -> list[_Told]:
     return [_against_others(places, frame, camera) for camera in range(places.shown.shape[1])]
 
 
-def _against_others(
-    places: FittedPlaces, frame: Int[np.ndarray, "rows"], camera: int
-) -> tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"]]:
-    """Frames in which a camera shows something, and what they tell of a shift of its places: equations [left | right].
+def _against_others(places: FittedPlaces, frame: Int[np.ndarray, "rows"], camera: int) -> _Told:
+    """What is told of one camera.
 
     The positions are eliminated: the left side is the part of the unit matrix that no position explains.
     """
@@ -84,16 +89,22 @@ def _against_others(
     solved = J @ np.linalg.inv(normal)
     left = np.eye(2) - solved @ J.swapaxes(-1, -2)
     rest_px = used.residual_px[:, camera] - np.matvec(solved, right)
-    frames, number = np.unique(frame[rows], return_inverse=True)
+    frames, number, count = np.unique(frame[rows], return_inverse=True, return_counts=True)
     equations = np.zeros((len(frames), 2, 3))
     np.add.at(equations, number, np.concatenate([left, rest_px[..., None]], axis=-1))
-    return frames, equations
+    shown = np.zeros((len(frames), used.shown.shape[1]))
+    np.add.at(shown, number, weight)
+    return frames, equations, shown / count[:, None]
 
 
 def _steps(
-    camera: int, frames: Int[np.ndarray, "frames"], equations: Float[np.ndarray, "frames 2 3"]
+    camera: int,
+    frames: Int[np.ndarray, "frames"],
+    equations: Float[np.ndarray, "frames 2 3"],
+    shown: Float[np.ndarray, "frames cameras"],
 ) -> Iterator[Knock]:
     """The clearest step of a camera, by each length of the windows, if it is one."""
+    shown_so_far = np.concatenate([np.zeros((1, shown.shape[1])), np.cumsum(shown, axis=0)])
     total = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(equations, axis=0)])
     for window in _WINDOWS:
         if len(frames) < 6 * window:
@@ -101,7 +112,10 @@ def _steps(
         first = np.arange(window, len(frames) - window + 1)
         change_px, clear = _change(total[first] - total[first - window], total[first + window] - total[first])
         usual = np.sqrt(np.median(clear) / _CHI2_MEDIAN)
-        best = int(clear.argmax())
+        before, after = (shown_so_far[stop] - shown_so_far[stop - window] for stop in (first, first + window))
+        alike = (np.abs(after - before) <= _OTHERS_CHANGE * window).all(axis=1)
+        alike &= frames[first + window - 1] - frames[first - window] <= _DENSE * 2 * window
+        best = int(np.where(alike, clear, 0.0).argmax())
         at = first[best]
         shortest = total[at] - total[at - _WINDOWS[0] // 2], total[at + _WINDOWS[0] // 2] - total[at]
         stays = [
