@@ -142,7 +142,7 @@ def _warn_of_millimetres(pair: AlignedPair, has_matches: bool) -> None:
     """Warn of tracks that are nowhere near the reference, and would be near it if their unit was the millimetre."""
     far_m = np.linalg.norm(pair.ref_m[:, :, None] - pair.est_m[:, None] / 1e3, axis=-1)
     near = far_m[np.isfinite(far_m)] < GATE_M
-    # Of as many tracks as drones, one in so many pairs is a right one.
+    # Of all pairs of a track and a drone, one in as many as there are drones is right.
     if not has_matches and near.size and near.mean() > 0.5 / max(pair.distance_m.shape[1:]):
         logger.warning(
             "the tracks are far away, and near the reference as millimetres: write their positions in metres"

@@ -73,7 +73,7 @@ def orderly_interrupts() -> Iterator[None]:
         signal.signal(number, _interrupt)
     sys.unraisablehook = dropped
     try:
-        with _watched():
+        with _watched(), _interrupts_behind_errors():
             yield
     except KeyboardInterrupt:
         for number in before:
@@ -143,6 +143,20 @@ def _repeat(number: int) -> None:
     again = threading.Timer(_AGAIN_S, send)
     again.daemon = True
     again.start()
+
+
+@contextlib.contextmanager
+def _interrupts_behind_errors() -> Iterator[None]:
+    """Raise the interrupt instead of an error that the clean-up of a library raised because of the interrupt."""
+    try:
+        yield
+    except Exception as error:
+        behind: BaseException | None = error
+        while behind is not None and not isinstance(behind, KeyboardInterrupt):
+            behind = behind.__context__
+        if behind is None:
+            raise
+        raise behind from None
 
 
 @contextlib.contextmanager

@@ -52,6 +52,21 @@ def run(started):
 psotrack.cli.main = run
 psotrack.__main__.main()
 """
+#: A command in a library that raises an error of its own when it is interrupted.
+IN_A_LIBRARY = """
+import signal, zipfile
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import psotrack.__main__
+import psotrack.cli
+
+def run(started):
+    with zipfile.ZipFile("a.zip", "w") as zipped:
+        left_open = zipped.open("half", "w")
+        signal.raise_signal(signal.SIGINT)
+
+psotrack.cli.main = run
+psotrack.__main__.main()
+"""
 #: A command whose worker processes say something when they end.
 WITH_NOISY_WORKERS = """
 import atexit, os, signal, sys, time
@@ -166,6 +181,13 @@ def test_a_computation_that_answers_no_signal_is_ended(start_python, tmp_path):
     time.sleep(0.2)
     assert_ends(process, signal.SIGINT)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_of_a_library_that_is_interrupted_is_no_traceback(start_python, tmp_path, monkeypatch):
+    """Found: "Can't close the ZIP file" in `archive`, after Ctrl-C."""
+    monkeypatch.chdir(tmp_path)
+    _, err = start_python("-c", IN_A_LIBRARY).communicate(timeout=FOREVER_S)
+    assert re.fullmatch(r"psotrack: interrupted; .*\n", err)
 
 
 @pytest.mark.slow

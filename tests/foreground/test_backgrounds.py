@@ -324,7 +324,7 @@ class TestLiving:
 NUM_FRAMES, BURST = 150, range(60, 65)
 BLACK, BLUE = np.uint8([0, 0, 0]), np.uint8([255, 0, 0])
 _noise = np.random.default_rng(8)
-#: Frames -> what the camera shows instead of each: a light that is so many times as bright, or another picture.
+#: Frames -> what the camera shows instead of each: the brightness as a factor, or another picture.
 LOST_LIGHT = {
     "begins dark": {i: (i + 1) / 15 for i in range(15)},
     "begins slowly": {i: (i + 1) / 40 for i in range(40)},

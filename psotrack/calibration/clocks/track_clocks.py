@@ -314,7 +314,7 @@ _Stretches = tuple[
 def _offsets_of_stretches(
     rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline, least: int
 ) -> _Stretches:
-    """Constant offsets in each of several stretches of at least so many instants."""
+    """Constant offsets in each of several stretches, each of at least `least` instants."""
     num_stretches = int(np.clip(len(points_px) // least, 1, _MOST_STRETCHES))
     parts = np.array_split(np.arange(len(points_px)), num_stretches)
     estimates = [

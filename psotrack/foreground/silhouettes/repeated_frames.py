@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy.ndimage import percentile_filter
 
-#: Every so many pixels of an image are compared, along each side; a place has 2 x 2 of them.
+#: Distance between the pixels that are compared, along each side of an image; a place has 2 x 2 of these pixels.
 _SPARSE = 4
 #: Frames, on each side, whose changes tell the usual change at a frame, and which of these changes, in percent: more
 #: frames than this may be repeated without being usual.
