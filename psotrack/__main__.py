@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 
 from psotrack.support.interrupts import Terminated, end, orderly_interrupts
@@ -17,6 +18,7 @@ def main() -> None:
             from psotrack.cli import main as run
 
             run(started)
+            sys.exit()
     except Terminated:
         end(signal.SIGTERM)
     except KeyboardInterrupt:

@@ -48,7 +48,8 @@ def orderly_interrupts() -> Iterator[None]:
     """Within the block Ctrl-C raises `KeyboardInterrupt` and SIGTERM raises `Terminated`, at the next safe moment.
 
     A program that has not ended after `_IN_ORDER_S`, or that gets a second signal, is ended at once: its temporary
-    files are removed, its worker processes are told to end, and the line is written.
+    files are removed, its worker processes are told to end, and the line is written. After `SystemExit` signals are
+    ignored: the program has finished.
     """
     # Only the main thread has signals.
     if threading.current_thread() is not threading.main_thread():
@@ -75,7 +76,8 @@ def orderly_interrupts() -> Iterator[None]:
     try:
         with _watched(), _interrupts_behind_errors():
             yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):
+        # The program ends: its last steps, in which Python has no handlers any more, are not interrupted.
         for number in before:
             signal.signal(number, signal.SIG_IGN)
         raise

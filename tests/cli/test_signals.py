@@ -67,6 +67,20 @@ def run(started):
 psotrack.cli.main = run
 psotrack.__main__.main()
 """
+#: A command that has finished, and gets a signal while Python ends.
+AT_THE_END = """
+import signal, sys
+import psotrack.__main__
+
+class Last:
+    # At the end of Python all modules are empty.
+    def __del__(self, send=signal.raise_signal, number=signal.SIGTERM):
+        send(number)
+
+sys.modules["last"] = Last()
+sys.argv = ["psotrack", "--version"]
+psotrack.__main__.main()
+"""
 #: A command whose worker processes say something when they end.
 WITH_NOISY_WORKERS = """
 import atexit, os, signal, sys, time
@@ -188,6 +202,14 @@ def test_an_error_of_a_library_that_is_interrupted_is_no_traceback(start_python,
     monkeypatch.chdir(tmp_path)
     _, err = start_python("-c", IN_A_LIBRARY).communicate(timeout=FOREVER_S)
     assert re.fullmatch(r"psotrack: interrupted; .*\n", err)
+
+
+def test_a_signal_after_the_end_changes_nothing(start_python):
+    """Found: a command whose results were whole ended with code -15 and without a line."""
+    process = start_python("-c", AT_THE_END)
+    out, err = process.communicate(timeout=FOREVER_S)
+    assert (process.returncode, err) == (0, "")
+    assert out.startswith("psotrack ")
 
 
 @pytest.mark.slow
