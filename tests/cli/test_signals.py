@@ -209,7 +209,7 @@ def test_a_signal_after_the_end_changes_nothing(start_python):
     process = start_python("-c", AT_THE_END)
     out, err = process.communicate(timeout=FOREVER_S)
     assert (process.returncode, err) == (0, "")
-    assert out.startswith("psotrack ")
+    assert "version" in out
 
 
 @pytest.mark.slow
