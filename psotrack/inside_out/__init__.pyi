@@ -1,6 +1,6 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .filtering import PoseFilterParams, smooth
-from .frames import FrameSource, open_source
+from .frames import FrameSource, markers_of_images, markers_of_video, open_source, write_marker_table
 from .fusing import FusedTracks, fuse, write_fused
 from .lens_files import choose_lens, lens_from_matrix
 from .localising import LocalisedVideo, LocaliseSettings, localise_video
@@ -21,7 +21,6 @@ from .marker_map import (
     read_marker_table,
     read_measured_corners,
 )
-from .marker_table import markers_of_images, markers_of_video, write_marker_table
 from .pose import PoseSettings
 from .rolling_shutter import LineTime, RollingShutter
 

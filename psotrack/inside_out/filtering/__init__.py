@@ -4,8 +4,8 @@ In: a `CameraPath` whose poses each come from one frame, or one `FramePose` afte
 filtered or smoothed poses, velocities, covariances and status. Other rooms use `filter_path`, `smooth`,
 `PoseFilterParams`, and, frame by frame, `step`.
 
-Imports go in this order: `motion` (a Kalman filter), `pose_filter` (which poses belong to the motion), `agility` (how
-wildly the camera moves), `smoothing`.
+Imports go in this order: `motion` (a Kalman filter), `pose_filter` (which poses belong to the motion), `smoothing`
+(paths of recordings, and how wildly the camera moves).
 """
 
 import lazy_loader

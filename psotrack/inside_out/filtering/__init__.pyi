@@ -1,4 +1,3 @@
-from .agility import choose_agility
 from .motion import Agility, MotionEstimate
 from .pose_filter import (
     Estimated,
@@ -11,7 +10,7 @@ from .pose_filter import (
     poses_of,
     step,
 )
-from .smoothing import filter_path, smooth, smoothed_motions
+from .smoothing import choose_agility, filter_path, smooth, smoothed_motions
 
 __all__ = [
     "Agility",

@@ -4,8 +4,7 @@ In: a `CameraPath` for each drone that carries a camera, and `Trajectories` of s
 the arm between camera and silhouette, and the scales of both sources' covariances for each drone. Other rooms use
 `fuse`, its results, and `write_fused`.
 
-Imports go in this order: `sources` (both at the same frames), `pairing` (which track belongs to which drone),
-`weighting` (one drone), `fused` (all drones, and their table).
+`weighting` has one drone; `fused` says which track belongs to which drone, and has all drones and their table.
 """
 
 import lazy_loader

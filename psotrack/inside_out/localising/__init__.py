@@ -4,8 +4,7 @@ In: a `FrameSource`, a `MarkerMap`, the lens and `LocaliseSettings`. Out: a `Loc
 frames' own poses, and the time that each stage took. Other rooms use `localise_video`; `localise_frames` does the same
 for markers that are detected already.
 
-Imports go in this order: `records`, `frame_poses` (poses frame by frame), `recording` (all frames of a recording),
-`video`.
+`frame_poses` has the poses frame by frame, `recording` all frames of a recording.
 """
 
 import lazy_loader

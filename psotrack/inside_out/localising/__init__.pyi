@@ -1,7 +1,5 @@
-from .frame_poses import FollowedFrame, own_path
-from .recording import localise_frames
-from .records import STAGES, LocalisedVideo, LocaliseSettings
-from .video import localise_video
+from .frame_poses import STAGES, FollowedFrame, LocalisedVideo, LocaliseSettings, own_path
+from .recording import localise_frames, localise_video
 
 __all__ = [
     "STAGES",

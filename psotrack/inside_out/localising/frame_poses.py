@@ -1,9 +1,12 @@
-"""Poses of frames whose markers are detected, one after the other: each frame's own pose, and the filter's estimate."""
+"""Poses of frames whose markers are detected, one after the other: each frame's own pose, and the filter's estimate.
+
+Also the settings and the result of localising a camera in a video.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,13 +26,14 @@ from psotrack.inside_out.filtering import (
     expected,
     filled,
     orientations,
+    smooth,
     step,
 )
-from psotrack.inside_out.localising.records import LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import CameraPose, MarkerPose, PoseSettings, estimate_pose
 from psotrack.inside_out.rolling_shutter import (
     Detected,
+    LineTime,
     PosesAt,
     RollingShutter,
     at_middle_row,
@@ -38,6 +42,8 @@ from psotrack.inside_out.rolling_shutter import (
 )
 from psotrack.trajectories import Status
 
+#: Stages that each frame passes; the first two run in a thread of their own.
+STAGES = ("decode", "grey", "detect", "locate", "filter")
 #: Number of markers that the paper requires. A pose from fewer markers is flagged, even if the settings allow it.
 PAPER_MARKERS = 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
@@ -48,6 +54,65 @@ _CHOICES = (5, 10, 20, 40, 80)
 _TURNS = 3
 #: Standard deviations of velocity (m/s) and turn rate (rad/s) where nothing is known of the motion.
 _UNKNOWN_RATES = np.repeat([5.0, 3.0], 3)
+
+
+@dataclass(frozen=True)
+class LocaliseSettings:
+    """Settings of localising a camera.
+
+    Attributes:
+        dictionary: name of the markers' dictionary, such as 4x4_1000.
+        pose: settings of pose estimation.
+        filter: parameters of the causal filter; None returns every frame's own pose.
+        shutter: the camera's rolling shutter; None is estimated from a recording, and is a global shutter otherwise.
+    """
+
+    dictionary: str = "4x4_1000"
+    pose: PoseSettings = field(default_factory=PoseSettings)
+    filter: PoseFilterParams | None = field(default_factory=PoseFilterParams)
+    shutter: RollingShutter | None = None
+
+
+@dataclass(frozen=True)
+class LocalisedVideo:
+    """Path of a camera in a video, or in frames whose markers are detected.
+
+    Attributes:
+        path: filtered path; equal to `raw` without a filter.
+        raw: path of each frame's own pose.
+        constant: (frames, 6, 6), part of the covariances of `raw` by errors that are the same in all frames.
+        shutter: the shutter with which the poses were estimated.
+        marker_map: the map; where only centres were given, with the corners that were found.
+        line_time: the line time that the frames show; None if it was not estimated: in a stream, and without five
+            consecutive frames that show enough markers.
+        wrong_markers: ids of the markers that are not where the map has them; they were left out, unless most
+            of the seen markers are wrong.
+        unknown_markers: ids of seen markers whose centres were given, but whose corners could not be found.
+        interrupted: whether Ctrl-C ended a stream.
+        seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
+        wall_s: seconds from the first frame to the last.
+    """
+
+    path: CameraPath
+    raw: CameraPath
+    constant: Float[np.ndarray, "frames 6 6"]
+    shutter: RollingShutter
+    marker_map: MarkerMap
+    line_time: LineTime | None = None
+    wrong_markers: tuple[int, ...] = ()
+    unknown_markers: tuple[int, ...] = ()
+    interrupted: bool = False
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    wall_s: float = 0.0
+
+    def smoothed(self, params: PoseFilterParams | None = None) -> CameraPath:
+        """The path with every pose estimated from all frames."""
+        return smooth(self.raw, params, self.constant)
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames per second of wall time."""
+        return self.raw.num_frames / max(self.wall_s, 1e-9)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ or the faults of a map (`MapCheck`). Other rooms use these records with `build_m
 `find_sightings` and `corners_in_own_frame`.
 
 Imports go in this order: `sightings` (markers in frames), `adjusting` (bundle adjustment), `initial_map`, `building`,
-`checking`, `from_centres`.
+`checking`.
 """
 
 import lazy_loader

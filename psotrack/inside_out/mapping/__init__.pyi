@@ -1,6 +1,5 @@
-from .building import BuiltMap, build_map, corners_in_own_frame
+from .building import BuiltMap, build_map, complete_map, corners_in_own_frame
 from .checking import MapCheck, check_map
-from .from_centres import complete_map
 from .sightings import find_sightings
 
 __all__ = [

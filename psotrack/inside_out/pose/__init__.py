@@ -4,8 +4,8 @@ In: corners of markers in the image (pixels) and in the world (metres), the lens
 `MarkerPose` with its covariance and the probability that another pose is the right one. Other rooms use
 `estimate_pose`, `estimate_noise` and these records, and nothing else of this room.
 
-Imports go in this order: `records`; `equations` (linear equations of the corners); `estimating` (the estimation);
-`noise` (the variances of a recording).
+Imports go in this order: `equations` (the records, the linear equations of the corners, and the variances of a
+recording); `estimating` (the estimation).
 """
 
 import lazy_loader

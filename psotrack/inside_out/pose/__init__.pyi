@@ -1,7 +1,5 @@
-from .equations import Equations
+from .equations import CameraPose, CornerNoise, Equations, MarkerPose, PoseSettings, estimate_noise
 from .estimating import estimate_pose
-from .noise import estimate_noise
-from .records import CameraPose, CornerNoise, MarkerPose, PoseSettings
 
 __all__ = [
     "CameraPose",

@@ -1,4 +1,4 @@
-"""Linear equations of one frame's corners in the pose, with the covariance of the corners' errors.
+"""Poses with their uncertainty, and the linear equations of one frame's corners from which they come.
 
 The error of a corner has four parts. (1) Its own error. A corner is the intersection of two lines that are fitted to
 edges, and each line has two corners. A line that is found turned moves its two corners in opposite directions, so that
@@ -6,15 +6,23 @@ the mean of a marker's corners is more accurate than the mean of independent err
 its marker's place, in the map and in this frame, which all corners of the marker have. (3) An inset: the white around a
 black marker shines into the marker, and each corner is found too far inside. (4) The error of the focal length. Inset
 and focal length are one number each for all corners of a frame: they are unknowns with a prior.
+
+How large the first two are in a recording, the residuals of its frames tell together, because a single frame has few
+markers. Both variances are chosen so that the weighted squares of the residuals are as large as their covariances let
+expect (estimation of variance components: W. Förstner, Ein Verfahren zur Schätzung von Varianz- und
+Kovarianzkomponenten, Allgemeine Vermessungs-Nachrichten 86, 1979). Residuals do not show all errors: a shift of all
+corners in the image looks like a turn of the camera.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import NEAR_M, Camera, cross_matrices, to_pixels_with_jacobian
 
 #: Standard deviation of a marker's mean error by edges, as a multiple of that of independent corners. With points over
@@ -176,3 +184,146 @@ def linearised(
 
 def _unit(vectors: Float[np.ndarray, "markers 4 2"]) -> Float[np.ndarray, "markers 4 2"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
+@dataclass(frozen=True)
+class CornerNoise:
+    """Errors of the markers in a recording.
+
+    Attributes:
+        scale: standard deviation of a corner, as a multiple of the one that its detection states.
+        place_m: standard deviation of the error that all corners of a marker have in one frame, along each axis of the
+            world, metres.
+        shift_px: standard deviation of a shift of all corners of a frame along x and along y, pixels, such as by a
+            shaken sensor. It looks like a turn of the camera, so that no residual shows it and it is not learned; in
+            drawn videos it was 0.012 to 0.017 px.
+    """
+
+    scale: float = 1.0
+    place_m: float = 0.0003
+    shift_px: float = 0.015
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "place_m", "shift_px"):
+            check_positive(name, getattr(self, name))
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """Settings of pose estimation.
+
+    Attributes:
+        min_markers: smallest number of markers that a pose is estimated from, 1 or more.
+        map_error_m: standard deviation of the position along each axis of markers whose map states none, metres; the
+            same error in every frame.
+        focal_error: standard deviation of the focal length, as a fraction of it; the same error in every frame.
+        noise: errors of the corners; None is estimated from a recording, and is `CornerNoise()` otherwise.
+    """
+
+    min_markers: int = 4
+    map_error_m: float = 0.0
+    focal_error: float = 0.0
+    noise: CornerNoise | None = None
+
+    def __post_init__(self) -> None:
+        if self.min_markers < 1:
+            raise SettingsError("min_markers", expected="at least 1", found=f"{self.min_markers}")
+        for name in ("map_error_m", "focal_error"):
+            if not 0 <= getattr(self, name) < 1:
+                found = f"{getattr(self, name):g}"
+                raise SettingsError(name, expected="a number from 0 to below 1", found=found)
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Pose of a camera, with its uncertainty.
+
+    Attributes:
+        position_m: (3,), the camera's centre, world, metres.
+        R_world_cam: (3, 3), camera to world; camera axes x right, y down, z ahead.
+        covariance: (6, 6), as in `CameraPath`: of the position along the world's axes (m) and of a small turn about the
+            camera's axes (rad).
+        constant: (6, 6), the part of the covariance by errors that are the same in all frames, such as those of the map
+            and of the focal length: no number of frames averages them out.
+        ambiguity: probability that another pose is the right one, 0 to 1/2.
+        num_markers: number of markers behind the pose.
+    """
+
+    position_m: Float[np.ndarray, "3"]
+    R_world_cam: Float[np.ndarray, "3 3"]
+    covariance: Float[np.ndarray, "6 6"]
+    constant: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
+    ambiguity: float = 0.0
+    num_markers: int = 0
+
+    @property
+    def varying(self) -> Float[np.ndarray, "6 6"]:
+        """(6, 6), covariance without the constant part."""
+        return self.covariance - self.constant
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerPose(CameraPose):
+    """Pose of a camera from the markers in one frame.
+
+    Attributes:
+        used: (markers,), True for the markers that the pose explains.
+        reprojection_px: root mean square distance, over the used corners, between image and projection, pixels.
+        equations: linear equations of the corners at this pose; None if unknown.
+        log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
+    """
+
+    used: Bool[np.ndarray, "markers"]
+    reprojection_px: float
+    equations: Equations | None = None
+    log_evidence: float = 0.0
+
+    @property
+    def fits(self) -> Bool[np.ndarray, "markers 4"]:
+        """(markers, 4), True for the corners that the pose explains."""
+        return np.repeat(self.used[:, None], 4, axis=1) if self.equations is None else self.equations.fits
+
+
+#: Weight of the variances before, as a number of residuals.
+_PRIOR_RESIDUALS = 10.0
+#: Number of estimates, each with the covariances by the one before. Smallest and largest deviations.
+_TURNS = 20
+_LEAST, _MOST = CornerNoise(0.1, 1e-5), CornerNoise(30.0, 0.05)
+
+
+def estimate_noise(frames: Sequence[Equations], noise: CornerNoise) -> CornerNoise:
+    """The errors by the residuals of frames.
+
+    Args:
+        frames: equations of frames at their poses.
+        noise: errors with which the poses were estimated.
+    """
+    frames = [one for one in frames if one.fits.sum() > 4]
+    factor = np.array([1.0, noise.place_m**2])
+    for _ in range(_TURNS):
+        sums = np.full((2, 2), _PRIOR_RESIDUALS)
+        for one in frames:
+            sums += _observed_and_expected(replace(one, variances=(factor[0], factor[1], one.variances[2])))
+        factor = factor * sums[0] / sums[1]
+        least = (_LEAST.scale / noise.scale) ** 2, _LEAST.place_m**2
+        most = (_MOST.scale / noise.scale) ** 2, _MOST.place_m**2
+        factor = np.clip(factor, least, most)
+    own, place_m = np.sqrt(factor)
+    return replace(noise, scale=float(noise.scale * own), place_m=float(place_m))
+
+
+def _observed_and_expected(frame: Equations) -> Float[np.ndarray, "2 2"]:
+    """Weighted squares of a frame's residuals by the corners' own errors and by the places; and their expectations."""
+    try:
+        step, covariance = frame.solved(np.zeros(2))
+    except np.linalg.LinAlgError:
+        return np.zeros((2, 2))
+    weight = frame.weight
+    weighted = (weight @ (frame.residual_px - frame.slopes @ step)[..., None])[..., 0]
+    by_unknowns = weight @ frame.slopes
+    left = weight - by_unknowns @ covariance @ by_unknowns.swapaxes(1, 2)
+    own, place_m2, _ = frame.variances
+    parts = own * frame.own, place_m2 * frame.by_place
+    observed = [float(np.einsum("mi,mij,mj->", weighted, part, weighted)) for part in parts]
+    expected = [float(np.einsum("mij,mji->", left, part)) for part in parts]
+    return np.array([observed, expected])

@@ -26,8 +26,15 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import Solver, solve_pnp
 from psotrack.errors import InputError
 from psotrack.geometry import NEAR_M, Camera, undistort
-from psotrack.inside_out.pose.equations import Equations, SeenMarkers, linearised
-from psotrack.inside_out.pose.records import CameraPose, CornerNoise, MarkerPose, PoseSettings
+from psotrack.inside_out.pose.equations import (
+    CameraPose,
+    CornerNoise,
+    Equations,
+    MarkerPose,
+    PoseSettings,
+    SeenMarkers,
+    linearised,
+)
 
 #: Position of the camera and rotation from camera to world.
 _InitialPose = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
