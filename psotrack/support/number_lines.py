@@ -80,7 +80,9 @@ def read_numbers(path: Path, columns: int, expected: str, *, more: bool = False)
         values = [float(word) for word in words[:columns]] if are_numbers(words[:columns]) else []
         if len(values) < columns or (len(words) > columns and not more) or not all(map(is_moderate, values)):
             found = repr(line.strip()[:80])
-            raise InputError(f"{path}, line {number}", expected=expected, found=found)
+            # Decimal commas look like twice the numbers.
+            points = ", with decimal points" if len(line.split()) == columns < len(words) else ""
+            raise InputError(f"{path}, line {number}", expected=f"{expected}{points}", found=found)
         rows.append(values)
         lines.append(number)
     if not rows:

@@ -173,7 +173,11 @@ def test_a_folder_with_one_image_of_few_markers_has_its_pose(localise, drawn, tm
     [
         ("70,55.4", "--dictionary=5x5_1000", "no frame shows a marker of the map: check --dictionary"),
         ("70,55.4", "--min-markers=14", "of the map: --min-markers requires 14"),
-        ("20,70", "--smooth", "no pose fits the markers: check --markers, and --camera or --fov"),
+        (
+            "20,70",
+            "--smooth",
+            "no pose fits the markers: check --markers, --camera or --fov, and that no image is mirrored",
+        ),
     ],
 )
 def test_without_any_pose_the_output_says_what_to_check(localise, fov, option, advice):

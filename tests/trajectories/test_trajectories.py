@@ -140,6 +140,7 @@ LINES = {
 #: The same for a file of TUM.
 TUM_LINES = {
     "0.04 1 2 3 0 0 0": "8 finite numbers",
+    "0,04 1,5 2 3 0 0 0 1": "8 finite numbers: timestamp tx ty tz qx qy qz qw, with decimal points",
     "0.04 1 2 3 0 0 0 0": "a quaternion",
     "0.0 1 2 3 0 0 0 1": "times that increase from line to line",
 }

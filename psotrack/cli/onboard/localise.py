@@ -336,9 +336,9 @@ def _doubt(content: dict[str, Any]) -> str:
     if content["poses"]:
         return ""
     if not most and not content["wrong_markers"]:
-        return "; no frame shows a marker of the map: check --dictionary and --markers"
+        return "; no frame shows a marker of the map: check --dictionary, --markers, and that no image is mirrored"
     if content["own_poses"] and not content["wrong_markers"]:
         return f"; the filter rejected all {content['own_poses']} poses: --no-filter keeps them"
     if most < content["min_markers"] and not content["wrong_markers"]:
         return f"; no frame shows more than {most} markers of the map: --min-markers requires {content['min_markers']}"
-    return "; no pose fits the markers: check --markers, and --camera or --fov"
+    return "; no pose fits the markers: check --markers, --camera or --fov, and that no image is mirrored"
