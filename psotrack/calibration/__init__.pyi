@@ -1,17 +1,13 @@
-from .board_corners import BoardFinder
-from .board_page import save_board
-from .board_recognition import describe_board, detect_board
-from .boards import Board
-from .bundle import Bundle, BundleProblem, BundleState, KnownLens, summed
-from .extrinsics import Located, locate_camera
+from .board_recognition import BoardFinder, describe_board, detect_board
+from .boards import Board, save_board
+from .bundle import GATE, Bundle, BundleProblem, BundleState, KnownLens, spread_px, summed
+from .extrinsics import Located, Solver, locate_camera, ray_distances, solve_pnp, solve_pnp_ransac
 from .image_points import (
     ImagePoints,
     find_markers,
     read_image_points,
 )
 from .lens_models import LensModel, known_lenses, lens_of_view, parse_lens_model
-from .pnp import Solver, ray_distances, solve_pnp, solve_pnp_ransac
-from .residuals import GATE, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, start_lenses
 from .rig.by_board import calibrate_by_board
 from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
@@ -25,7 +21,6 @@ from .rig.findings import (
     say_searched,
     worst_views,
 )
-from .rig.images import CameraImages, choose_instants, instants_of_numbers, open_images, open_recorded
 from .rig.lenses import choose_lens_model
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.point_files import (
@@ -39,7 +34,16 @@ from .rig.point_files import (
 )
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.shifts import Shift, find_board_shifts, find_point_shifts
-from .rig.views import BoardViews, FoundBoards, find_views
+from .rig.views import (
+    BoardViews,
+    CameraImages,
+    FoundBoards,
+    choose_instants,
+    find_views,
+    instants_of_numbers,
+    open_images,
+    open_recorded,
+)
 from .rig.world import Similarity, align, world_of_camera
 
 __all__ = [
@@ -90,7 +94,6 @@ __all__ = [
     "find_point_shifts",
     "find_views",
     "fit_world",
-    "inflation",
     "instants_of_numbers",
     "known_lenses",
     "lens_of_view",

@@ -1,4 +1,4 @@
-"""Calibration boards: ChArUco boards, chessboards, and grids of ArUco markers or AprilTags.
+"""Calibration boards: ChArUco boards, chessboards, and grids of ArUco markers or AprilTags; and a board to print.
 
 A board's own axes are those of OpenCV: seen from the front, x points right and y points down, so that z points away
 from the viewer, into the board. The origin is the board's top left corner, for a grid the first marker's.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Literal, get_args
 
 import cv2
@@ -17,10 +18,14 @@ from jaxtyping import Float, Int
 from psotrack.calibration.rig.settings import BoardSettings
 from psotrack.errors import SettingsError, check_positive
 from psotrack.foreground.markers import marker_dictionary
+from psotrack.support import atomic_write, refuse_to_overwrite
 
 BoardKind = Literal["charuco", "chessboard", "grid"]
 #: Smallest number of corners of a view that counts, or all that the board has.
 LEAST_CORNERS = 6
+#: White border about a board, in sides of a square; resolution of a square, pixels; millimetres of an inch.
+_BORDER, _SQUARE_PX, _INCH_MM = 1.0, 120, 25.4
+_SUFFIXES = (".pdf", ".png", ".svg")
 
 
 @dataclass(frozen=True)
@@ -173,3 +178,37 @@ def _steps(
 ) -> Int[np.ndarray, "points 2"]:
     """(points, 2), column and row of each point of a grid, row by row."""
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+
+def save_board(path: Path | str, board: Board, *, force: bool = False) -> Path:
+    """Draw a ChArUco board to print at 100 %.
+
+    Args:
+        path: file of the page, .pdf, .png or .svg.
+        board: the board.
+        force: whether an existing file is replaced.
+
+    Raises:
+        SettingsError: the file has another ending.
+        OutputError: the file exists and `force` is not set, or cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    path = Path(path)
+    if path.suffix.lower() not in _SUFFIXES:
+        raise SettingsError("board", expected=f"a file that ends in {', '.join(_SUFFIXES)}", found=path.name)
+    refuse_to_overwrite(path, force)
+    columns, rows = board.squares_wh
+    drawn = board.opencv().generateImage((columns * _SQUARE_PX, rows * _SQUARE_PX))
+    size = np.array([columns, rows]) + 2 * _BORDER
+    figure = Figure(figsize=tuple(1e3 * board.square_m / _INCH_MM * size))
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, size[0]), ylim=(0, size[1]))
+    axes.axis("off")
+    edges = (_BORDER, _BORDER + columns, _BORDER, _BORDER + rows)
+    axes.imshow(drawn, cmap="gray", vmin=0, vmax=255, extent=edges, interpolation="nearest")
+    axes.set(xlim=(0, size[0]), ylim=(0, size[1]))
+    words = f"{columns} x {rows} squares of {1e3 * board.square_m:g} mm, dictionary {board.dictionary}: print at 100 %"
+    axes.text(_BORDER, _BORDER / 2, words, fontsize=8, va="center")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=300)
+    return path

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import log
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -30,11 +31,32 @@ from psotrack.geometry.estimation import (
     levenberg_marquardt,
 )
 
+#: A point is an outlier beyond this number of standard deviations: 4 in a million good points are.
+GATE = 5.0
 _MAX_STEPS = 100
 #: Relative change of the cost that ends the search; the robust search only has to find the outliers.
 _LEAST_GAIN, _LEAST_GAIN_ROBUST = 1e-9, 1e-4
 #: Noise of a corner, pixels, below which no outlier is looked for.
 LEAST_NOISE_PX = 0.02
+
+
+def spread_px(distance_px: Float[np.ndarray, " residuals"], unknowns: int) -> float:
+    """Estimate σ along each axis from the median of distances in the image, which may contain outliers.
+
+    Args:
+        distance_px: (residuals,), distances of a fit, pixels. With no more equations than unknowns the result is 0.
+        unknowns: number of fitted unknowns.
+    """
+    equations = 2 * len(distance_px)
+    if equations <= unknowns:
+        return 0.0
+    # The median of a Rayleigh distribution is σ √(2 ln 2); a fit takes the unknowns' part of the squares away.
+    return float(np.median(distance_px) / np.sqrt(2 * log(2) * (1 - unknowns / equations)))
+
+
+def centre_by_pose(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 6"]:
+    """(3, 6), derivative of a camera's centre, -Rᵀ t, by a small turn about its axes and by its translation."""
+    return np.hstack([-R.T @ cross_matrices(t_m), -R.T])
 
 
 @runtime_checkable

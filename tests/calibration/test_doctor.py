@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import psotrack as pt
-from psotrack.calibration.doctor import evidence, examine
+from psotrack.calibration.doctor import examine, fault_search
 from psotrack.calibration.doctor.common_points import CommonPoints
 from psotrack.calibration.doctor.corrections import PER_CAMERA, Corrected, WeightedPoints, linearise, weigh
 from psotrack.geometry import Rig
@@ -367,8 +367,8 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     rig, data = small_problem()
     points = data.points
     at = Corrected(rig, np.zeros(4))
-    gathered = evidence.gather(at, data)
-    hypotheses = evidence.list_hypotheses(4, range(4))
+    gathered = fault_search.gather(at, data)
+    hypotheses = fault_search.list_hypotheses(4, range(4))
     (hypothesis,) = [each for each in hypotheses if each.kind == "turned" and each.camera == 1]
     found = gathered.judge(hypothesis, gathered.as_sound).log_odds
 
@@ -386,7 +386,7 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     piece = points.piece[point]
     same_piece = same_axis & (piece[:, None] == piece)
     side_px = points.side_px[point, camera]
-    floor_px = np.hypot(side_px, evidence._SMALL_BOX_PX)
+    floor_px = np.hypot(side_px, fault_search._SMALL_BOX_PX)
     of_floor = np.where(same_piece, np.outer(floor_px, floor_px), 0.0)
     # An error that changes linearly over the image.
     image = (points.centre_px - rig.cameras.K[:, :2, 2]) / (rig.cameras.image_size_wh / 2)
@@ -398,15 +398,15 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     turn[camera != 1] = 0.0
 
     as_sound, as_turned = [], []
-    sizes = product(evidence._PIECE_ERRORS, evidence._CAMERA_ERRORS, evidence._CALIBRATION_PX)
+    sizes = product(fault_search._PIECE_ERRORS, fault_search._CAMERA_ERRORS, fault_search._CALIBRATION_PX)
     for of_piece, of_camera, of_calibration in sizes:
-        rare = evidence._RARE * ((of_camera > 0.1) + (of_calibration > 0.7))
+        rare = fault_search._RARE * ((of_camera > 0.1) + (of_calibration > 0.7))
         covariance = white + of_piece**2 * of_floor + of_camera**2 * of_side + of_calibration**2 * smooth
         as_sound.append(rare + multivariate_normal.logpdf(residual_px, cov=covariance))
-        for factor in evidence._PRIOR_FACTORS:
+        for factor in fault_search._PRIOR_FACTORS:
             wide = covariance + factor**2 * turn @ turn.T
             as_turned.append(rare + multivariate_normal.logpdf(residual_px, cov=wide))
-    expected = np.logaddexp.reduce(as_turned) - np.log(len(evidence._PRIOR_FACTORS))
+    expected = np.logaddexp.reduce(as_turned) - np.log(len(fault_search._PRIOR_FACTORS))
     expected -= np.logaddexp.reduce(as_sound)
     assert found == pytest.approx(expected, abs=0.01)
 

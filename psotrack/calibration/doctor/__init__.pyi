@@ -1,6 +1,5 @@
-from .diagnosis import Diagnosis
+from .diagnosis import Diagnosis, Finding
 from .examination import examine, sampled_frames
-from .findings import Finding
 
 __all__ = [
     "Diagnosis",

@@ -23,9 +23,8 @@ from psotrack.calibration.doctor.corrections import (
     misfit_px,
     weigh,
 )
-from psotrack.calibration.doctor.diagnosis import Diagnosis
-from psotrack.calibration.doctor.fault_search import find_fault, find_lags
-from psotrack.calibration.doctor.findings import (
+from psotrack.calibration.doctor.diagnosis import (
+    Diagnosis,
     Finding,
     describe_disagreement,
     describe_fault,
@@ -33,6 +32,7 @@ from psotrack.calibration.doctor.findings import (
     describe_knock,
     describe_reference,
 )
+from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
 from psotrack.geometry import Rig, project_visible
 from psotrack.tracking.camera_errors import FittedPlaces, Knock, find_knock

@@ -28,15 +28,16 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.boards import Board
 from psotrack.calibration.bundle import (
+    GATE,
     LEAST_NOISE_PX,
     Bundle,
     BundleState,
+    centre_by_pose,
     median_by_camera,
     solve_robustly,
     summed,
 )
 from psotrack.calibration.lens_models import LensModel
-from psotrack.calibration.residuals import GATE, centre_by_pose
 from psotrack.calibration.rig.chain import Chain, join_cameras
 from psotrack.calibration.rig.lenses import LEAST_VIEWS, MOST_FITS, choose_lens_model, find_lens
 from psotrack.calibration.rig.views import BoardViews

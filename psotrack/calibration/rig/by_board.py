@@ -30,19 +30,20 @@ from psotrack.calibration.rig.findings import (
     say_starts,
     worst_views,
 )
-from psotrack.calibration.rig.images import (
+from psotrack.calibration.rig.point_files import fit_world, read_world, world_in_words
+from psotrack.calibration.rig.settings import RigSettings
+from psotrack.calibration.rig.shifts import find_board_shifts
+from psotrack.calibration.rig.views import (
     CameraImages,
+    FoundBoards,
     Instants,
     choose_instants,
+    find_views,
     first_images,
     instants_of_numbers,
     open_images,
     open_recorded,
 )
-from psotrack.calibration.rig.point_files import fit_world, read_world, world_in_words
-from psotrack.calibration.rig.settings import RigSettings
-from psotrack.calibration.rig.shifts import find_board_shifts
-from psotrack.calibration.rig.views import FoundBoards, find_views
 from psotrack.errors import errors_name
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings.datasets import is_recording, open_recording

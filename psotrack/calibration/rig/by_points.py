@@ -14,7 +14,6 @@ from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.image_points import find_markers, read_image_points
 from psotrack.calibration.lens_models import lens_of_view, lenses_at_size
 from psotrack.calibration.rig.findings import RigCalibration
-from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
     PointRig,
@@ -33,6 +32,7 @@ from psotrack.calibration.rig.point_files import (
 )
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.shifts import find_point_shifts
+from psotrack.calibration.rig.views import open_images
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
 from psotrack.geometry import Rig, chosen_camera, make_rig

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 
 from psotrack.calibration.boards import Board
 from psotrack.calibration.bundle import Bundle, BundleState, solve_robustly
+from psotrack.calibration.extrinsics import ray_distances, solve_pnp
 from psotrack.calibration.lens_models import PINHOLE, LensModel
-from psotrack.calibration.pnp import ray_distances, solve_pnp
 from psotrack.support import Advance
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.

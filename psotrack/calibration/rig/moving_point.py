@@ -24,10 +24,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.bundle import Bundle, BundleState
+from psotrack.calibration.bundle import GATE, Bundle, BundleState, spread_px
+from psotrack.calibration.extrinsics import solve_pnp_ransac
 from psotrack.calibration.lens_models import known_lenses
-from psotrack.calibration.pnp import solve_pnp_ransac
-from psotrack.calibration.residuals import GATE, spread_px
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, triangulate_linearly, undistort

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.extrinsics import solve_pnp_ransac
 from psotrack.calibration.lens_models import LensModel
-from psotrack.calibration.pnp import solve_pnp_ransac
 from psotrack.calibration.rig.lenses import find_board_poses
 from psotrack.calibration.rig.moving_point import PointViews
 from psotrack.calibration.rig.views import BoardViews
