@@ -136,7 +136,7 @@ def compiled_folder(chosen: str | Path | None) -> Path:
 
 def beside(sequence: Path, name: str) -> Path:
     """Default of `--out`: `name` in the folder `results` of a recording, or beside an archive."""
-    from psotrack.cli.archived import archive_of
+    from psotrack.cli.settings import archive_of
 
     archive = archive_of(click.get_current_context())
     if archive is not None:
@@ -173,7 +173,7 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
 
 def recording_named(sequence: Path, tracks: Path) -> str:
     """How the record beside tracks names their recording; empty for an archive, whose content is gone afterwards."""
-    from psotrack.cli.archived import archive_of
+    from psotrack.cli.settings import archive_of
     from psotrack.show.flights import recording_beside
 
     return "" if archive_of(click.get_current_context()) is not None else recording_beside(sequence, tracks)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from psotrack.cli.archived import chosen_extent, with_comparison
 from psotrack.cli.commands import command
 from psotrack.cli.options import (
     DETECTOR_SIZE,
@@ -20,7 +19,7 @@ from psotrack.cli.options import (
     recording_named,
 )
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.settings import TrackingSettings, chosen_settings
+from psotrack.cli.settings import TrackingSettings, chosen_extent, chosen_settings, with_comparison
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.foreground.detection import Layout

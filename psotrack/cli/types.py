@@ -104,6 +104,6 @@ def opened_sequence(path: Path) -> Path:
     """The path of a sequence; that of a temporary folder with the content of an archive."""
     if path.suffix.lower() != ARCHIVE_SUFFIX or path.is_dir():
         return path
-    from psotrack.cli.archived import opened_archive
+    from psotrack.cli.settings import opened_archive
 
     return opened_archive(click.get_current_context(), path)

@@ -1,9 +1,16 @@
-from .cameras import LiveCamera, live_cameras
 from .meeting import CameraCounts, Instant, Meeting
 from .messages import UdpLines, WebSocketLines, lines_of, write_lines
 from .recorder import CameraRecorder, RecordedCounts, recording_folder
 from .session import WAIT_S, LiveResult, LiveSession, RowsOutput
-from .sources import CameraStream, LiveSource, ReplayedVideo, SourceFrame, StreamClock
+from .sources import (
+    CameraStream,
+    LiveCamera,
+    LiveSource,
+    ReplayedVideo,
+    SourceFrame,
+    StreamClock,
+    live_cameras,
+)
 
 __all__ = [
     "WAIT_S",

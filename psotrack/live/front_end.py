@@ -25,10 +25,9 @@ from psotrack.foreground.silhouettes import (
     ignored_pixels,
     reduce_frame,
 )
-from psotrack.live.cameras import LiveCamera
 from psotrack.live.meeting import STOPPED_S, Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
-from psotrack.live.sources import ANSWER_S, SourceFrame
+from psotrack.live.sources import ANSWER_S, LiveCamera, SourceFrame
 
 logger = logging.getLogger(__name__)
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.foreground.silhouettes import Exposures, usual_drone_px
-from psotrack.live.cameras import LiveCamera
 from psotrack.live.front_end import FrontEnd
 from psotrack.live.meeting import Instant, Meeting, MeetingCamera
 from psotrack.live.recorder import RecordedCounts
+from psotrack.live.sources import LiveCamera
 from psotrack.pipeline import causal_settings, causal_tracker
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings

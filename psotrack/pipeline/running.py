@@ -32,9 +32,14 @@ from psotrack.foreground.silhouettes import (
     find_background,
     scaled_settings,
 )
-from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, warn_of_unknown_clocks, with_clocks
+from psotrack.pipeline.corrections import (
+    advise_on_clocks,
+    estimate_clocks,
+    warn_of_unknown_clocks,
+    with_clocks,
+    without_knocked,
+)
 from psotrack.pipeline.inputs import Run, prepare, usable_for
-from psotrack.pipeline.knocks import without_knocked
 from psotrack.pipeline.parts import (
     MethodInputs,
     Parts,

@@ -1,7 +1,18 @@
 from .array_checks import first_repeat, first_repeated, first_true, has_negative_eigenvalue
 from .calls import check_records, checked
 from .compiled import as_written, drop_programs_if_many, keep_compiled, measured_compiling
-from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
+from .delimited import (
+    Column,
+    Table,
+    TextRow,
+    are_numbers,
+    first_line,
+    number_words,
+    read_numbers,
+    read_rows,
+    read_table,
+    write_rows,
+)
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, FAINT, INK, LINE, STYLE, drone_colour, save_figure
 from .files import (
@@ -21,7 +32,6 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_table
-from .number_lines import are_numbers, first_line, number_words, read_numbers
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,

@@ -315,7 +315,7 @@ def test_an_archive_that_unpacks_to_far_more_than_it_is(tmp_path, monkeypatch):
         after.writestr("zeros.csv", bytes(8 << 20))
         after.writestr("psotrack.json", json.dumps(manifest | {"files": [*manifest["files"], "zeros.csv"]}))
     archives.unpack(path, tmp_path / "usual")
-    monkeypatch.setattr("psotrack.pipeline.archives.zip_file._SMALL", 1 << 20)
+    monkeypatch.setattr("psotrack.pipeline.archives.archive_file._SMALL", 1 << 20)
     limit = "a.psotrack: expected files of at most"
     assert_refused(lambda: archives.unpack(path, tmp_path / "folder"), limit, unchanged=tmp_path)
 

@@ -30,7 +30,7 @@ from psotrack.geometry import make_camera, project
 from psotrack.recordings import FrameTimes, Recording, Reference, probe, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.recordings.exchange import FORMATS, Footage, export_tracks, read_tracks
-from psotrack.recordings.exchange.ros_messages import DEFINITIONS, camera_message
+from psotrack.recordings.exchange.mcap_files import DEFINITIONS, camera_message
 from psotrack.trajectories import Status, Trajectories, read_trajectories
 
 #: Names of outputs that hold all of the small tracks, per format.

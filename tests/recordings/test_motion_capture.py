@@ -19,8 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.recordings.exchange import read_tracks
 from psotrack.recordings.mocap import Markers, marker_bodies, read_c3d, write_c3d
-from psotrack.recordings.mocap.marker_cross_poses import correct_labels, cross_poses, identify_markers
-from psotrack.recordings.mocap.marker_crosses import fit_rigid, learn_cross
+from psotrack.recordings.mocap.marker_crosses import (
+    correct_labels,
+    cross_poses,
+    fit_rigid,
+    identify_markers,
+    learn_cross,
+)
 from psotrack.trajectories import Status, Trajectories, resample
 
 # --- C3D files of any maker

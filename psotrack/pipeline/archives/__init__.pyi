@@ -1,7 +1,6 @@
+from .archive_file import FORMAT_VERSION, MANIFEST_FILE, Manifest, PackedVideo, read_manifest, unpack
 from .comparison import ArchiveComparison, compare_with_archive
-from .manifest import FORMAT_VERSION, MANIFEST_FILE, Manifest, PackedVideo, read_manifest
 from .packing import pack_tracks
-from .zip_file import unpack
 
 __all__ = [
     "FORMAT_VERSION",

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from psotrack.pipeline.archives.manifest import Manifest, TrackRecord, read_record
+from psotrack.pipeline.archives.archive_file import Manifest, TrackRecord, read_record
 from psotrack.settings import TrackSettings, flatten
 from psotrack.trajectories import read_trajectories
 

@@ -15,8 +15,14 @@ from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import compute, stored_silhouettes
 from psotrack.geometry.rig_files import camera_values
 from psotrack.pipeline import detection_files_of, usable_for
-from psotrack.pipeline.archives.manifest import Manifest, PackedVideo, TrackRecord, read_record
-from psotrack.pipeline.archives.zip_file import Source, write_archive
+from psotrack.pipeline.archives.archive_file import (
+    Manifest,
+    PackedVideo,
+    Source,
+    TrackRecord,
+    read_record,
+    write_archive,
+)
 from psotrack.recordings import (
     ARRAY_FILE,
     RECORDING_FILE,

@@ -29,7 +29,7 @@ from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.geometry.rig_files import UNITS_M
-from psotrack.recordings.datasets._rows import lengths_of
+from psotrack.recordings.datasets._poses import lengths_of
 from psotrack.support import Column, Table, TextRow, are_numbers, first_line, read_rows, write_rows
 
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]

@@ -1,25 +1,46 @@
-"""`dronN_pos_25.csv` of the DPJAIT dataset: the poses of one simulated drone, one line per video frame.
+"""Where drones are over time: pose files of the DPJAIT dataset, and files of a reference in any format.
 
-Row i belongs to video frame i. Row 0 is a placeholder, (0, 0, -0), so that frame 0 has no pose. The names of the
-orientation columns in the published files are unknown. The reader uses four columns that end in `w`, `x`, `y`, `z`
-after a word with a `q` (`q_w`, `qw`, `quat_w`, ...) as the quaternion, which turns body into world coordinates. Euler
-angles are not read: beside a quaternion they are redundant, and without a quaternion their order would be a guess. The
-written columns are `rot_x[rad]`, `rot_y[rad]`, `rot_z[rad]`, with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`, `q_z`.
-"""
+In `dronN_pos_25.csv`, the poses of one simulated drone, row i belongs to video frame i. Row 0 is a placeholder,
+(0, 0, -0), so that frame 0 has no pose. The names of the orientation columns in the published files are unknown. The
+reader uses four columns that end in `w`, `x`, `y`, `z` after a word with a `q` (`q_w`, `qw`, `quat_w`, ...) as the
+quaternion, which turns body into world coordinates. Euler angles are not read: beside a quaternion they are redundant,
+and without a quaternion their order would be a guess. The written columns are `rot_x[rad]`, `rot_y[rad]`, `rot_z[rad]`,
+with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`, `q_z`."""
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import SettingsError
+from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import LENGTH_TOLERANCE
-from psotrack.recordings.datasets._rows import lengths_of
-from psotrack.support import Column, Table, TextRow, read_table, write_rows
+from psotrack.geometry.rig_files import UNITS_M
+from psotrack.recordings import Reference, Timeline
+from psotrack.recordings.mocap import marker_bodies, read_c3d
+from psotrack.support import Column, Table, TextRow, first_line, read_table, write_rows
+from psotrack.trajectories import Trajectories, merged, read_trajectories, resample
+from psotrack.trajectories.tum import read_tum
+
+
+def lengths_of(
+    table: Table, names: Sequence[str], units: Mapping[str, float] = UNITS_M
+) -> Callable[[TextRow], Float[np.ndarray, " names"]]:
+    """A function that gives the lengths in some columns of a row, metres.
+
+    Raises:
+        InputError: a column is missing, or has another unit; in a row: a value is not a number.
+    """
+    columns = [table.column(name) for name in names]
+    metres = np.array([table.factor(column, units) for column in columns])
+    return lambda row: np.array([row.number(column) for column in columns]) * metres
+
 
 #: Largest number of a frame, whatever the number of rows, and per row: arrays over all frames take memory.
 _FRAMES, _FRAMES_PER_ROW = 1_000_000, 100
@@ -169,3 +190,116 @@ def write_mocap_markers(path: Path | str, markers_m: Float[np.ndarray, "frames 4
     """
     rows = ([frame, *values] for frame, values in enumerate(markers_m.reshape(-1, len(_MARKER_COLUMNS))))
     write_rows(path, [["id", *_MARKER_COLUMNS], *rows])
+
+
+_logger = logging.getLogger(__name__)
+#: Ending of a pose file's name that states its rate, such as `dron1_pos_25`.
+_RATE = re.compile(r"_(?:pos|cam)_(?P<rate>\d+(?:\.\d+)?)$")
+#: Names of drones in the dataset; `drone_1` is `dron1`.
+_DRONE = re.compile(r"drone?_?(?=\d+$)", re.IGNORECASE)
+_SUFFIXES = (".csv", ".parquet", ".tum", ".txt", ".c3d")
+
+
+#: Labels of the markers of each drone, as the user says.
+Bodies = Mapping[str, Sequence[str]]
+
+
+def read_reference(
+    files: Sequence[Path], timeline: Timeline, bodies: Bodies | None = None, offset_s: float = 0.0
+) -> Reference:
+    """The reference that is in some files; each file is read once.
+
+    Args:
+        files: C3D files, TUM files, pose files of the dataset, or files of tracks.
+        timeline: the recording's instants. Their rate is that of pose files whose name does not end in the rate, such
+            as `dron1_pos_25.csv`, and of tracks without times.
+        bodies: labels of the markers of each drone in the C3D file; None or empty: by the labels.
+        offset_s: time on the recording's clock at which the files' clock shows 0, seconds.
+
+    Raises:
+        InputError: a file cannot be read, or a drone has two files.
+    """
+    time_s = timeline.time_s
+    found = _read_files(files, timeline.rate_hz, bodies)
+    truth = _at_times(found, np.arange(len(time_s)), time_s, later_s=-offset_s)
+    if not truth.seen.any():
+        begin_s = min(each.time_s[0] for each in found) + offset_s
+        end_s = max(each.time_s[-1] for each in found) + offset_s
+        _logger.warning(
+            "the reference says nothing about the recording, which lasts from %.3f to %.3f s: it lasts from %.3f to "
+            "%.3f s on the recording's clock; see [reference] time_offset_s",
+            time_s[0], time_s[-1], begin_s, end_s,
+        )  # fmt: skip
+    for path, each in zip(files, found, strict=True):
+        if unit := timeline.unit_of(each.time_s):
+            _logger.warning("%s: its times look like %s: write seconds", path, unit)
+    own = finest = max(found, key=lambda each: each.num_frames)
+    if len(found) > 1:
+        own = _at_times(found, finest.frame, finest.time_s, later_s=0.0)
+    own = replace(own, time_s=own.time_s + offset_s)
+    return Reference(truth, own, tuple(files), bodies or {}, offset_s)
+
+
+def _read_files(paths: Sequence[Path], fps: float, bodies: Bodies | None) -> list[Trajectories]:
+    """The reference of each file, at its own rate and with its own clock."""
+    recorded = [path for path in paths if path.suffix.lower() == ".c3d"]
+    if bodies and len(recorded) != 1:
+        found_files = ", ".join(path.name for path in recorded) or "none"
+        raise InputError(
+            f"bodies {', '.join(bodies)}", expected="one C3D file that holds their markers", found=found_files
+        )
+    found = [_read(path, fps, bodies) for path in paths]
+    places: dict[str, Path] = {}
+    for path, reference in zip(paths, found, strict=True):
+        for drone in reference.drones:
+            if drone in places:
+                raise InputError(
+                    path, expected="one file per drone", found=f"{drone} in {places[drone]} as well"
+                )
+            places[drone] = path
+    return found
+
+
+def _at_times(
+    references: Sequence[Trajectories],
+    frame: Int[np.ndarray, "frames"],
+    time_s: Float[np.ndarray, "frames"],
+    *,
+    later_s: float,
+) -> Trajectories:
+    """One reference of all drones at given times; NaN where a file says nothing.
+
+    Args:
+        references: references of different drones, at least one.
+        frame: (frames,), numbers of the frames.
+        time_s: (frames,), times of the frames, seconds.
+        later_s: the clock of the references shows t + `later_s` at time t, seconds.
+    """
+    parts = [resample(reference, frame, time_s, later_s=later_s) for reference in references]
+    return merged(parts, [frame] * len(parts), lambda _: time_s)
+
+
+def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
+    suffix = path.suffix.lower()
+    if suffix == ".c3d":
+        return marker_bodies(read_c3d(path), path, bodies)
+    if suffix in (".tum", ".txt"):
+        return read_tum(path)
+    if suffix == ".parquet" or (suffix == ".csv" and "x_m" in first_line(path)):
+        return read_trajectories(path, fps=fps)
+    if suffix == ".csv":
+        return _read_pose_file(path, fps)
+    raise InputError(path, expected=f"a file that ends in {', '.join(_SUFFIXES)}", found=path.name)
+
+
+def _read_pose_file(path: Path, fps: float) -> Trajectories:
+    rate = _RATE.search(path.stem)
+    position_m, orientation_wxyz = read_poses(path)
+    frame = np.arange(len(position_m))
+    return Trajectories(
+        frame,
+        frame / (fps if rate is None else float(rate["rate"])),
+        (_DRONE.sub("dron", path.stem if rate is None else path.stem[: rate.start()]),),
+        position_m[:, None],
+        orientation_wxyz=None if orientation_wxyz is None else orientation_wxyz[:, None],
+    )

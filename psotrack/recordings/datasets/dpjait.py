@@ -30,7 +30,7 @@ from psotrack.recordings import (
     probe,
 )
 from psotrack.recordings.datasets._onboard import is_onboard_video, read_onboard
-from psotrack.recordings.datasets._reference import read_reference
+from psotrack.recordings.datasets._poses import read_reference
 from psotrack.recordings.mocap import NoDronesError
 
 CALIBRATION = "cameras_calibration.csv"

@@ -47,7 +47,7 @@ from psotrack.recordings import (
     read_timestamps,
     warn_of_missing_numbers,
 )
-from psotrack.recordings.datasets._reference import read_reference
+from psotrack.recordings.datasets._poses import read_reference
 
 _logger = logging.getLogger(__name__)
 #: Rate of pictures until their timestamps are read.

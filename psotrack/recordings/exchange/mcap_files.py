@@ -8,7 +8,8 @@
 
 Stamps are times on the recording's clock, from 0 on. A drone whose name is no ROS name, such as `0`, has the topic
 /drone_0/pose; the metadata record `psotrack` has the names. The folder of a rosbag2 bag can be read, too. The libraries
-mcap and mcap-ros2-support are an extra: `pip install '.[ros]'`.
+mcap and mcap-ros2-support are an extra: `pip install '.[ros]'`. The definitions of messages, which MCAP files carry,
+are those of the packages std_msgs, geometry_msgs, sensor_msgs and tf2_msgs of ROS 2 (Humble and newer).
 """
 
 from __future__ import annotations
@@ -28,15 +29,149 @@ from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError, install_command
-from psotrack.geometry import Rig
+from psotrack.geometry import Camera, Rig
 from psotrack.recordings import Recording, read_frames
-from psotrack.recordings.exchange import ros_messages as ros
 from psotrack.recordings.exchange.camera_boxes import CameraFrames, Footage, camera_frames
 from psotrack.recordings.exchange.timed_paths import joined, timed_path
 from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat
 from psotrack.trajectories import Trajectories
+
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMAGE = "sensor_msgs/msg/CompressedImage"
+
+#: Variance of each angle of an orientation that is not known, rad²: the message has no other way to say so.
+UNKNOWN_RAD2 = 1e9
+
+#: Lines of the definition of each message, and of the types of its fields.
+_LINES = {
+    POSE: ("std_msgs/Header header", "geometry_msgs/PoseWithCovariance pose"),
+    TRANSFORMS: ("geometry_msgs/TransformStamped[] transforms",),
+    CAMERA_INFO: (
+        "std_msgs/Header header", "uint32 height", "uint32 width", "string distortion_model", "float64[] d",
+        "float64[9] k", "float64[9] r", "float64[12] p", "uint32 binning_x", "uint32 binning_y",
+        "sensor_msgs/RegionOfInterest roi",
+    ),
+    IMAGE: ("std_msgs/Header header", "string format", "uint8[] data"),
+    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
+    "geometry_msgs/PoseWithCovariance": ("geometry_msgs/Pose pose", "float64[36] covariance"),
+    "geometry_msgs/Pose": ("geometry_msgs/Point position", "geometry_msgs/Quaternion orientation"),
+    "geometry_msgs/Point": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/Vector3": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/Quaternion": ("float64 x", "float64 y", "float64 z", "float64 w"),
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header", "string child_frame_id", "geometry_msgs/Transform transform",
+    ),
+    "geometry_msgs/Transform": ("geometry_msgs/Vector3 translation", "geometry_msgs/Quaternion rotation"),
+    "sensor_msgs/RegionOfInterest": (
+        "uint32 x_offset", "uint32 y_offset", "uint32 height", "uint32 width", "bool do_rectify",
+    ),
+}  # fmt: skip
+
+
+def _definition(message: str) -> str:
+    """Definition of a message with those of its parts."""
+    names = [message]
+    # Names are found while the list is read.
+    for name in names:
+        kinds = [line.split()[0].removesuffix("[]") for line in _LINES[name]]
+        names += dict.fromkeys(kind for kind in kinds if kind in _LINES and kind not in names)
+    parts = [f"{'=' * 80}\nMSG: {name}\n" + "\n".join(_LINES[name]) for name in names[1:]]
+    return "\n".join([*_LINES[message], *parts]) + "\n"
+
+
+#: Definition of each message with those of its parts.
+DEFINITIONS = {name: _definition(name) for name in (POSE, TRANSFORMS, CAMERA_INFO, IMAGE)}
+
+
+def header(time_ns: int, frame: str) -> dict[str, Any]:
+    """A header with a time and the name of a coordinate frame."""
+    return {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": frame}
+
+
+def pose_message(
+    head: dict[str, Any],
+    position_m: Float[np.ndarray, "3"],
+    orientation_wxyz: Float[np.ndarray, "4"],
+    covariance_m2: Float[np.ndarray, "3 3"],
+) -> dict[str, Any]:
+    """A pose; orientation and covariance are NaN where they are not known.
+
+    A covariance of zeros is an unknown covariance, as in ROS; see `UNKNOWN_RAD2` for the orientation.
+    """
+    covariance = np.zeros((6, 6))
+    if np.isfinite(covariance_m2).all():
+        covariance[:3, :3] = covariance_m2
+    if not np.isfinite(orientation_wxyz).all():
+        covariance[[3, 4, 5], [3, 4, 5]] = UNKNOWN_RAD2
+    pose = {"position": _vector(position_m), "orientation": _quaternion(orientation_wxyz)}
+    return {"header": head, "pose": {"pose": pose, "covariance": covariance.ravel().tolist()}}
+
+
+def transform(
+    head: dict[str, Any],
+    child: str,
+    position_m: Float[np.ndarray, "3"],
+    orientation_wxyz: Float[np.ndarray, "4"],
+) -> dict[str, Any]:
+    """Where the coordinate frame `child` is; an unknown orientation, NaN, is the identity."""
+    place = {"translation": _vector(position_m), "rotation": _quaternion(orientation_wxyz)}
+    return {"header": head, "child_frame_id": child, "transform": place}
+
+
+def camera_pose(camera: Camera) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
+    """Centre of a camera in the world, metres, and its orientation, camera to world, w first; z looks ahead."""
+    R = np.asarray(camera.T_cam_world)[:3, :3]
+    return np.asarray(camera.centre_world), Rotation.from_matrix(R.T).as_quat(scalar_first=True)
+
+
+def camera_message(head: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
+    """Intrinsics and lens of a camera; None for a lens that the message cannot hold.
+
+    ROS has plumb_bob (5 coefficients), rational_polynomial (8) and equidistant (the fisheye model, 4), all without
+    skew; thin prisms and tilted sensors have no place.
+    """
+    dist, K = np.asarray(camera.dist, float), np.asarray(camera.K, float)
+    if K[0, 1] != 0:
+        return None
+    if camera.fisheye is not None and bool(camera.fisheye):
+        model, d = "equidistant", np.resize(dist[:4], 4)
+    elif not dist[5:].any():
+        model, d = "plumb_bob", np.pad(dist[:5], (0, 5 - len(dist[:5])))
+    elif not dist[8:].any():
+        model, d = "rational_polynomial", dist[:8]
+    else:
+        return None
+    width, height = np.asarray(camera.image_size_wh).astype(int).tolist()
+    return {
+        "header": head,
+        "height": height,
+        "width": width,
+        "distortion_model": model,
+        "d": d.tolist(),
+        "k": K.ravel().tolist(),
+        "r": np.eye(3).ravel().tolist(),
+        "p": np.hstack([K, np.zeros((3, 1))]).ravel().tolist(),
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }
+
+
+def _vector(values: Float[np.ndarray, "3"]) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def _quaternion(orientation_wxyz: Float[np.ndarray, "4"]) -> dict[str, float]:
+    wxyz = orientation_wxyz if np.isfinite(orientation_wxyz).all() else (1.0, 0.0, 0.0, 0.0)
+    return dict(zip("wxyz", map(float, wxyz), strict=True))
+
 
 WORLD, METADATA = "world", "psotrack"
 _JPEG_QUALITY = 90
@@ -44,7 +179,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 #: Bytes of the record at a file's end, with the mark after it.
 _FOOTER_BYTES = 37
 #: Types of messages whose poses are read.
-_READ = (ros.POSE, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
+_READ = (POSE, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 #: Time in nanoseconds, topic, type and content of a message.
 _Message = tuple[int, str, str, dict[str, Any]]
 #: Time in seconds, position, orientation and the 36 numbers of the covariance of a pose.
@@ -87,7 +222,7 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
             images = [_image_messages(footage, each, name, advance) for name, each in filmed.items()]
             streams = [places, *streams, *images]
         writer = writer_class(stream)
-        schemas = {name: writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
+        schemas = {name: writer.register_msgdef(name, text) for name, text in DEFINITIONS.items()}
         drones = dict(zip((f"/{name}/pose" for name in names), trajectories.drones, strict=True))
         writer.add_metadata(METADATA, {"version": "1", "drones": json.dumps(drones, ensure_ascii=False)})
         for time_ns, topic, kind, content in heapq.merge(*streams, key=lambda message: message[0]):
@@ -96,7 +231,7 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     if footage is None:
         return []
     lenses = [(camera.name, footage.recording.rig.cameras[camera.index]) for camera in frames]
-    lost = [name for name, lens in lenses if ros.camera_message({}, lens) is None]
+    lost = [name for name, lens in lenses if camera_message({}, lens) is None]
     return [f"the lens of {name}, for which ROS has no model" for name in lost]
 
 
@@ -187,7 +322,7 @@ def _path(where: str, name: str, rows: list[_Row]) -> Trajectories:
         raise InputError(where, expected=MODERATE, found=f"{orientation[far][0]:g} in an orientation")
     length = np.linalg.norm(orientation, axis=1)
     variance_rad2 = covariance[:, [21, 28, 35]]
-    unknown = (variance_rad2 >= ros.UNKNOWN_RAD2).any(axis=1) | (length == 0)
+    unknown = (variance_rad2 >= UNKNOWN_RAD2).any(axis=1) | (length == 0)
     orientation[~unknown] /= length[~unknown, None]
     orientation[unknown] = np.nan
     block = covariance.reshape(-1, 6, 6)[:, :3, :3]
@@ -228,30 +363,30 @@ def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advan
     covariance_m2 = values.get("covariance_m2", np.full((*seen.shape, 3, 3), np.nan))
     times_ns = np.round(trajectories.time_s.astype(float) * 1e9).astype(np.int64).tolist()
     for row, time_ns in enumerate(times_ns):
-        head = ros.header(time_ns, WORLD)
+        head = header(time_ns, WORLD)
         transforms = []
         advance(1)
         for drone in np.flatnonzero(seen[row]).tolist():
             pose = trajectories.position_m[row, drone], orientation_wxyz[row, drone]
-            message = ros.pose_message(head, *pose, covariance_m2[row, drone])
-            yield time_ns, f"/{names[drone]}/pose", ros.POSE, message
-            transforms.append(ros.transform(head, names[drone], *pose))
+            message = pose_message(head, *pose, covariance_m2[row, drone])
+            yield time_ns, f"/{names[drone]}/pose", POSE, message
+            transforms.append(transform(head, names[drone], *pose))
         if transforms:
-            yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": transforms}
+            yield time_ns, "/tf", TRANSFORMS, {"transforms": transforms}
 
 
 def _camera_messages(rig: Rig, cameras: dict[str, CameraFrames], last_s: float) -> Iterator[_Message]:
     """Lenses of the cameras at time 0, and their places at each whole second and at the end."""
     lenses = {name: rig.cameras[each.index] for name, each in cameras.items()}
     for name, lens in lenses.items():
-        info = ros.camera_message(ros.header(0, name), lens)
+        info = camera_message(header(0, name), lens)
         if info is not None:
-            yield 0, f"/{name}/camera_info", ros.CAMERA_INFO, info
-    poses = [(name, *ros.camera_pose(lens)) for name, lens in lenses.items()]
+            yield 0, f"/{name}/camera_info", CAMERA_INFO, info
+    poses = [(name, *camera_pose(lens)) for name, lens in lenses.items()]
     last_ns = round(last_s * 1e9)
     for time_ns in (*range(0, last_ns, 10**9), last_ns):
-        head = ros.header(time_ns, WORLD)
-        yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": [ros.transform(head, *pose) for pose in poses]}
+        head = header(time_ns, WORLD)
+        yield time_ns, "/tf", TRANSFORMS, {"transforms": [transform(head, *pose) for pose in poses]}
 
 
 def _image_messages(
@@ -267,12 +402,12 @@ def _image_messages(
         if time_ns < 0:
             continue
         encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        head = ros.header(time_ns, name)
-        info = ros.camera_message(head, one)
+        head = header(time_ns, name)
+        info = camera_message(head, one)
         if info is not None and time_ns > 0:
-            yield time_ns, f"/{name}/camera_info", ros.CAMERA_INFO, info
+            yield time_ns, f"/{name}/camera_info", CAMERA_INFO, info
         content = {"header": head, "format": "jpeg", "data": encoded}
-        yield time_ns, f"/{name}/image/compressed", ros.IMAGE, content
+        yield time_ns, f"/{name}/image/compressed", IMAGE, content
 
 
 def _library(name: str) -> ModuleType:

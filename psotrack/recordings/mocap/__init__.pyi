@@ -1,6 +1,5 @@
 from .c3d import Markers, read_c3d, write_c3d
-from .marker_bodies import marker_bodies
-from .marker_groups import NoDronesError
+from .marker_bodies import NoDronesError, marker_bodies
 
 __all__ = [
     "Markers",
