@@ -20,7 +20,7 @@ from helpers import assert_refused
 from psotrack.foreground.detection import DetectorSettings, OnnxDetector
 from psotrack.pipeline import archives
 from psotrack.recordings import probe, read_frames, read_image
-from psotrack.recordings.datasets import open_recording, read_masks, read_poses
+from psotrack.recordings.datasets import open_recording, read_poses
 from psotrack.recordings.exchange import read_tracks
 from psotrack.recordings.mocap import read_c3d
 from psotrack.settings import SwarmSettings, TrackSettings
@@ -287,19 +287,6 @@ def test_a_parquet_file_of_one_repeated_row(tmp_path, little_memory):
     assert path.stat().st_size < 100_000
     limit = "t.parquet: expected at most 1000000 rows in a file of"
     assert_refused(lambda: read_trajectories(path), limit, unchanged=tmp_path)
-
-
-@pytest.mark.parametrize("stated", [80 << 20, 100])
-def test_masks_that_unpack_to_gigabytes(stated, tmp_path, little_memory):
-    """Zeros of 80 MiB are 80 kB in a zip file; of what is stated, `zipfile` unpacks as many bytes as are stated."""
-    path = tmp_path / "drone_masks.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("cam1i/dron1/000000.png", bytes(80 << 20))
-    assert path.stat().st_size < 100_000
-    path.write_bytes(path.read_bytes().replace(struct.pack("<I", 80 << 20), struct.pack("<I", stated)))
-    with read_masks(path) as masks:
-        said = "000000.png: expected an image"
-        assert_refused(lambda: masks.mask("cam1i", 1, 0), said, unchanged=tmp_path)
 
 
 def test_an_archive_that_unpacks_to_far_more_than_it_is(tmp_path, monkeypatch):

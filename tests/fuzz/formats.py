@@ -187,12 +187,6 @@ def _dpjait(folder: Path) -> None:
     _copied("dpjait")(folder)
 
 
-def _all_masks(path: Path) -> None:
-    with datasets.read_masks(path) as masks:
-        for frame in masks.frames:
-            masks.mask("cam1i", 1, frame)
-
-
 def _published(file: str, *reads: Read, inside: Change | None = None) -> Format:
     def opened(path: Path) -> object:
         recording = datasets.open_recording(path.parents[file.count("/")])
@@ -215,7 +209,6 @@ _RECORDINGS = {
     "dpjait-onboard-poses": _published("dron1_cam_25.csv"),
     "dpjait-onboard-lenses": _published("drone_cameras_calibration.csv"),
     "dpjait-corners": _published("aruco_corners.csv", inside_out.read_marker_map),
-    "dpjait-masks": _published("drone_masks.zip", _all_masks, inside=members),
 }
 
 

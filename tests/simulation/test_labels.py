@@ -6,7 +6,6 @@ labels with boxes computed by hand and by OpenCV; a data set is read as a traine
 
 import json
 import math
-import zipfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +37,7 @@ from worlds import CAMERAS, NUM_FRAMES, two_flights
 from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
 from psotrack.geometry import look_at, make_camera
 from psotrack.recordings import FrameTimes, Reference, read_frames
-from psotrack.recordings.datasets import open_recording, read_masks
+from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import CameraRenderer, build, change_scenario
 from psotrack.simulation.imaging.raster import RasterView, pinhole
 from psotrack.simulation.labels.detector import detect, iou
@@ -168,37 +167,6 @@ def test_masks_and_frames_agree():
             if silhouette.xyxy is not None:
                 x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
                 assert silhouette.xyxy.tolist() == [x, y, x + width, y + height]
-
-
-# --- archives
-
-
-@pytest.mark.parametrize(
-    "layout",
-    [
-        "S02_D4_A/drone_masks/cam{camera}i_s/drone{drone}/frame_{frame}.png",
-        "Dron_{drone}/cam{camera}i_{frame:04d}.bmp",
-        "cam{camera}i_dron{drone}_{frame:05d}.PNG",
-        "{frame:06d}/cam{camera}i_s_drone{drone}.png",
-        "6088125{camera}/dron{drone}/{frame}.png",
-    ],
-)
-def test_layouts_that_name_camera_drone_and_frame_are_read(tmp_path, layout):
-    random = np.random.default_rng(0)
-    with zipfile.ZipFile(tmp_path / "masks.zip", "w") as archive:
-        archive.writestr("__MACOSX/._0.png", b"")
-        archive.writestr("readme.txt", b"")
-        for drone, frame in ((1, 0), (1, 7), (2, 0), (2, 7)):
-            expected = random.random((54, 97)) > 0.7
-            _, png = cv2.imencode(".png", 255 * expected.astype(np.uint8))
-            name = layout.format(camera=2, drone=drone, frame=frame)
-            archive.writestr(name, png.tobytes())
-    camera = "60881252" if layout.startswith("6088125") else "cam2i"
-    with read_masks(tmp_path / "masks.zip") as masks:
-        assert masks.cameras == (camera,)
-        assert masks.drones == (1, 2)
-        assert masks.frames == (0, 7)
-        np.testing.assert_array_equal(masks.mask(camera, 2, 7), expected)
 
 
 # --- detections

@@ -1,7 +1,6 @@
 """What the simulator refuses: each bad input is one line with the field, and nothing is written."""
 
 import json
-import zipfile
 
 import msgspec
 import numpy as np
@@ -14,7 +13,6 @@ from msgspec.structs import replace
 from placed_drones import S02
 
 from psotrack.errors import SettingsError
-from psotrack.recordings.datasets import read_masks
 from psotrack.simulation import (
     SimulationSettings,
     build,
@@ -122,19 +120,6 @@ def sticks(old, new):
         write_sticks(folder / "s.csv", SCRIPT)
         (folder / "s.csv").write_text((folder / "s.csv").read_text().replace(old, new, 1))
         return lambda: read_sticks(folder / "s.csv")
-
-    return make
-
-
-def masks(*names, drone=None):
-    """An archive of files of these names, of which none is an image; the mask of a drone is read."""
-
-    def make(folder, run):
-        path = folder / "drone_masks.zip"
-        with zipfile.ZipFile(path, "w") as archive:
-            for name in names:
-                archive.writestr(name, b"x")
-        return lambda: read_masks(path) if drone is None else read_masks(path).mask("cam1", drone, 0)
 
     return make
 
@@ -267,11 +252,6 @@ BAD = {
     "times that go back": (sticks("2.5", "0.2"), "line 4, column time_s: expected a time above 0.333333, found 0.2"),
     "an unknown device": (lambda folder, run: lambda: open_device("joystick", LABORATORY).__enter__(),
         "device: expected gamepad, keyboard, or a file ", "found joystick"),
-    # Archives of masks.
-    "no camera in a name": (masks("a/b/0.png"), "expected images such as cam1i/dron1/000000.png", "found a/b/0.png"),
-    "one frame twice": (masks("cam1i/dron1/1.png", "cam1i/dron1/01.png"),
-        "one image per camera", "found cam1i/dron1/1.png and "),
-    "no image": (masks("cam1i/dron1/0.png", drone=1), "cam1i/dron1/0.png: expected an image, found a file that"),
     # Sequences.
     "tiny images": (simulated(scale=0.01), "scale: expected images of at least 32 pixels a side, found 20 x 10"),
     "a negative seed": (simulated(seed=-1), "seed: expected 0 or more, found -1"),

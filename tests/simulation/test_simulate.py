@@ -23,7 +23,6 @@ from psotrack.recordings import probe, read_detections, read_frames
 from psotrack.recordings.datasets import (
     MARKER_CORNERS,
     read_marker_corners,
-    read_masks,
     read_sequence,
 )
 from psotrack.simulation import (
@@ -147,24 +146,27 @@ def test_masks_agree_with_the_renderer_and_detections_lie_on_the_drones(pair_fol
         data = archive.read("cam1i/dron1/000000.png")
         # Width, height, bit depth and colour type as the PNG standard defines them: one bit, grey.
         assert data[16:26] == (192).to_bytes(4, "big") + (108).to_bytes(4, "big") + b"\x01\x00"
-    with read_masks(pair_folder) as masks:
-        assert masks.cameras == ("cam1i", "cam2i")  # named like the video files
-        assert masks.drones == (1, 2)
-        assert masks.frames == tuple(range(7))
-        for index, camera in enumerate(scene.rig.names):
-            renderer = CameraRenderer(scene, index)
-            found = read_detections(recording.detections[camera])
-            for frame in masks.frames:
-                numbers = number_image(renderer, frame)
-                for drone in masks.drones:
-                    np.testing.assert_array_equal(masks.mask(camera, drone, frame), numbers == drone)
-                pixels, _ = project(recording.rig.cameras[index], position_m[frame])
-                for box in found.in_frame(frame).xyxy:
-                    low, high = box[:2], box[2:]
-                    away_px = np.linalg.norm(pixels - (low + high - 1) / 2, axis=-1)
-                    num_boxes += 1
-                    # A box's centre differs from the body's origin by less than the box's diagonal.
-                    num_near += away_px.min() < np.linalg.norm(high - low)
+        masks = {
+            name: cv2.imdecode(np.frombuffer(archive.read(name), np.uint8), cv2.IMREAD_GRAYSCALE) > 0
+            for name in archive.namelist()
+        }
+    assert len(masks) == 2 * 2 * 7
+    for index, camera in enumerate(scene.rig.names):
+        renderer = CameraRenderer(scene, index)
+        found = read_detections(recording.detections[camera])
+        for frame in range(7):
+            numbers = number_image(renderer, frame)
+            for drone in (1, 2):
+                # The name of the camera is that of the video file.
+                name = f"cam{index + 1}i/dron{drone}/{frame:06d}.png"
+                np.testing.assert_array_equal(masks[name], numbers == drone)
+            pixels, _ = project(recording.rig.cameras[index], position_m[frame])
+            for box in found.in_frame(frame).xyxy:
+                low, high = box[:2], box[2:]
+                away_px = np.linalg.norm(pixels - (low + high - 1) / 2, axis=-1)
+                num_boxes += 1
+                # A box's centre differs from the body's origin by less than the box's diagonal.
+                num_near += away_px.min() < np.linalg.norm(high - low)
     # About half of the 28 drones, boxes of about 10 px, are detected: 13; at most two boxes may be false detections.
     assert num_boxes >= 8
     assert num_near >= num_boxes - 2

@@ -7,7 +7,7 @@ from ._marker_corners import (
     split_label,
     write_marker_corners,
 )
-from ._masks import MASKS, Masks, MaskWriter, join_archives, read_masks
+from ._masks import MASKS, MaskWriter, join_archives
 from ._onboard import (
     ONBOARD_CALIBRATION,
     onboard_pose_file,
@@ -37,7 +37,6 @@ __all__ = [
     "DraftOptions",
     "MarkerRow",
     "MaskWriter",
-    "Masks",
     "Matching",
     "detection_files",
     "draft_recording",
@@ -52,7 +51,6 @@ __all__ = [
     "read_marker_centres",
     "read_marker_corners",
     "read_marker_rows",
-    "read_masks",
     "read_onboard",
     "read_onboard_calibration",
     "read_poses",
