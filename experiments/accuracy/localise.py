@@ -42,7 +42,7 @@ from psotrack.inside_out import (
 from psotrack.inside_out.mapping.sightings import MarkerSightings, outward
 from psotrack.recordings import VideoWriter, probe
 from psotrack.simulation import build, change_scenario, scenario, write_recorded_flight
-from psotrack.simulation.imaging.onboard import OnboardRenderer, lens, onboard_poses
+from psotrack.simulation.imaging.renderer import OnboardRenderer, lens, onboard_poses
 from psotrack.simulation.scene import Scene
 
 SIZE_WH, FPS, READOUT_S = (1280, 720), 30.0, 0.020

@@ -1,8 +1,7 @@
+from .flights.motion import read_recorded_flight, write_recorded_flight
 from .flights.piloting import flight_space, read_sticks
-from .flights.recordings import read_recorded_flight, write_recorded_flight
 from .generate import simulate
 from .imaging.renderer import CameraRenderer
-from .listing import catalogue
 from .own_cameras import OWN_CAMERAS, simulate_own_cameras
 from .scenarios import (
     RESTLESS,
@@ -14,7 +13,7 @@ from .scenarios import (
     preset_text,
     scenario,
 )
-from .scene import Scene, build
+from .scene import Scene, build, catalogue
 
 __all__ = [
     "OWN_CAMERAS",

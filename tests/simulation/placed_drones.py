@@ -12,10 +12,9 @@ from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.flights.motion import HarmonicFlight, Heading
 from psotrack.simulation.imaging import sensor
-from psotrack.simulation.labels.masks import silhouettes
+from psotrack.simulation.labels import silhouettes
 from psotrack.simulation.scenarios import Imaging
-from psotrack.simulation.world.drones import DroneModel
-from psotrack.simulation.world.models import box
+from psotrack.simulation.world.drones import DroneModel, box
 from psotrack.simulation.world.rooms import MARKER_DICTIONARY
 
 S02 = scenario("S02_D4_A")

@@ -41,7 +41,7 @@ from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.scenery import Scenery
 from psotrack.simulation.scenarios import Surroundings
-from psotrack.simulation.world.lighting import AMBIENT
+from psotrack.simulation.world.rooms import AMBIENT
 
 #: A place in the middle of the room, metres.
 MIDDLE = np.array([0.3, -0.2, 1.4])

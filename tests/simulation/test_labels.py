@@ -40,8 +40,7 @@ from psotrack.recordings import FrameTimes, Reference, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import CameraRenderer, build, change_scenario
 from psotrack.simulation.imaging.raster import RasterView, pinhole
-from psotrack.simulation.labels.detector import detect, iou
-from psotrack.simulation.labels.masks import Silhouette, silhouettes
+from psotrack.simulation.labels import Silhouette, detect, iou, silhouettes
 from psotrack.trajectories import Trajectories
 
 NO_ROOM_M = 90.0

@@ -18,17 +18,22 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import install_command
 from psotrack.simulation import flight_space
-from psotrack.simulation.flights import devices
-from psotrack.simulation.flights.devices import Gamepad, Panel, flying, key_sticks, open_device, poll
+from psotrack.simulation.flights import piloting
+from psotrack.simulation.flights.motion import read_recorded_flight
 from psotrack.simulation.flights.piloting import (
     DYNAMICS,
+    Gamepad,
+    Panel,
     Sample,
     Space,
     Sticks,
     fly,
+    flying,
+    key_sticks,
+    open_device,
+    poll,
     write_sticks,
 )
-from psotrack.simulation.flights.recordings import read_recorded_flight
 
 LABORATORY = flight_space("laboratory")
 UNBOUNDED_SPACE = Space(np.full(3, -1e6), np.full(3, 1e6))
@@ -394,7 +399,7 @@ def test_the_keyboard_flies_in_a_window_that_shows_keys_and_position(pyglet):
     title = window.set_caption.call_args_list[0].args[0]
     # The device uses the real clock, so the first time may be above 0.
     assert re.match(r"\d+\.\d s  x \+0\.00  y \+0\.00  z 1\.00 m  0\.00 m/s", title)
-    assert devices.KEYBOARD_HELP in title
+    assert piloting.KEYBOARD_HELP in title
     assert used[0].sticks == Sticks()
     assert used[-1].sticks == Sticks(forward=1.0)
     circles = modules["shapes"].Circle.call_args_list

@@ -25,10 +25,9 @@ from psotrack.simulation import (
     simulate_own_cameras,
     write_recorded_flight,
 )
-from psotrack.simulation.flights.devices import open_device
-from psotrack.simulation.flights.piloting import Sample, Sticks, fly, read_sticks, write_sticks
+from psotrack.simulation.flights.motion import read_recorded_flight
+from psotrack.simulation.flights.piloting import Sample, Sticks, fly, open_device, read_sticks, write_sticks
 from psotrack.simulation.flights.planning import plan
-from psotrack.simulation.flights.recordings import read_recorded_flight
 from psotrack.simulation.scenarios import (
     FlightFromFile,
     FollowingFlight,

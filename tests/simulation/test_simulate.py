@@ -31,16 +31,15 @@ from psotrack.simulation import (
     SimulationSettings,
     build,
     change_scenario,
+    generate,
     preset_text,
-    segments,
     simulate,
 )
+from psotrack.simulation.generate import unfinished
 from psotrack.simulation.imaging.lens_image import lens_image
-from psotrack.simulation.imaging.onboard import OnboardRenderer
-from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.raster import pinhole
-from psotrack.simulation.own_cameras import own_rig
-from psotrack.simulation.segments import unfinished
+from psotrack.simulation.imaging.renderer import OnboardRenderer
+from psotrack.simulation.own_cameras import PosedBoard, board_poses, draw_board, own_board, own_rig
 
 NAME = "S02_D4_A"
 #: A scenario of two cameras and two drones.
@@ -74,7 +73,7 @@ def pair_folder(tmp_path_factory):
 
     def make(folder):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(segments, "SEGMENT_FRAMES", 2)
+            patch.setattr(generate, "SEGMENT_FRAMES", 2)
             simulate(PAIR, folder, TINY, jobs=1)
 
     return make_once(tmp_path_factory, "pair_sequence", make) / "Simulated_Data" / NAME
@@ -82,7 +81,7 @@ def pair_folder(tmp_path_factory):
 
 @pytest.fixture
 def short_segments(monkeypatch):
-    monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
+    monkeypatch.setattr(generate, "SEGMENT_FRAMES", 2)
 
 
 def test_read_sequence_finds_every_file(pair_folder, scene):

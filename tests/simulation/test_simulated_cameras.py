@@ -39,13 +39,12 @@ from psotrack.recordings.datasets import onboard_pose_file, open_recording, read
 from psotrack.simulation import CameraRenderer, SimulationSettings, build, change_scenario, simulate
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import backdrop, raster, sensor
-from psotrack.simulation.imaging.onboard import OnboardRenderer, intrinsics, lens, onboard_poses
-from psotrack.simulation.imaging.painter import LIGHT_UNIT, RoomPainter
-from psotrack.simulation.imaging.shadows import FloorLight
-from psotrack.simulation.labels.masks import lens_silhouettes
+from psotrack.simulation.imaging.backdrop import LIGHT_UNIT, RoomPainter
+from psotrack.simulation.imaging.floor import FloorLight
+from psotrack.simulation.imaging.renderer import OnboardRenderer, intrinsics, lens, onboard_poses
+from psotrack.simulation.labels import lens_silhouettes
 from psotrack.simulation.scenarios import OnboardCamera
-from psotrack.simulation.world.halls import HALLS
-from psotrack.simulation.world.rooms import room
+from psotrack.simulation.world.rooms import HALLS, room
 
 
 @pytest.fixture

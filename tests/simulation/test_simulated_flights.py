@@ -11,13 +11,15 @@ from made_flights import ORBIT, WIDE, make_scenario, write_tracks
 from scipy.spatial.transform import Rotation
 
 from psotrack.simulation import change_scenario, preset_names, scenario, write_recorded_flight
-from psotrack.simulation.flights.motion import HarmonicFlight, Heading, quaternions_wxyz
-from psotrack.simulation.flights.planning import frame_times_s, plan
-from psotrack.simulation.flights.recordings import (
+from psotrack.simulation.flights.motion import (
+    HarmonicFlight,
+    Heading,
     Recorded,
     RecordedFlight,
+    quaternions_wxyz,
     read_recorded_flight,
 )
+from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import (
     Crossing,
     FlightFromFile,

@@ -16,8 +16,8 @@ from placed_drones import S02
 from psotrack.geometry import project
 from psotrack.simulation import build, catalogue, change_scenario, load, preset_names, preset_text, scenario
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, NearPass, Rotor
-from psotrack.simulation.world import drones, lighting, rooms
-from psotrack.simulation.world.halls import HALLS
+from psotrack.simulation.world import drones, rooms
+from psotrack.simulation.world.rooms import HALLS
 
 MODELS = {name: drones.model(name) for name in drones.MODELS}
 
@@ -227,7 +227,7 @@ def test_41_markers_are_on_the_walls_and_face_inwards(hall_name):
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)], ids=["floor", "wall"])
 def test_baked_light_agrees_with_the_visibility_of_the_lamp(normal):
     """The oracle tests points along the ray from each floor or wall point to each part of the lamp."""
-    panels = lighting.lamps(np.array([[0.3, -0.2, 4.0]]), (0.6, 0.4))
+    panels = rooms.lamps(np.array([[0.3, -0.2, 4.0]]), (0.6, 0.4))
     boxes = [
         rooms.Box((0.5, 0.5, 0.0), (0.9, 1.4, 1.1), (0.5,) * 3),
         rooms.Box((-1.3, -0.9, 0.8), (-0.4, -0.5, 0.9), (0.5,) * 3),  # a table's top
@@ -238,10 +238,10 @@ def test_baked_light_agrees_with_the_visibility_of_the_lamp(normal):
     u, v = np.meshgrid(np.linspace(-1.9, 1.9, 41), np.linspace(-1.9, 1.9, 37))
     nothing = np.zeros_like(u)
     points_m = np.stack([u, v, nothing] if normal[2] else [nothing + 2.0, u, v + 2.0], axis=-1)
-    baked = lighting.bake(points_m, np.array(normal), panels, boxes_m)
+    baked = rooms.bake(points_m, np.array(normal), panels, boxes_m)
     raised_m = points_m.reshape(-1, 3) + 2e-3 * np.array(normal)
     normals = np.broadcast_to(normal, raised_m.shape)
-    expected = np.full(len(raised_m), lighting.AMBIENT * (0.85 + 0.15 * normal[2]))
+    expected = np.full(len(raised_m), rooms.AMBIENT * (0.85 + 0.15 * normal[2]))
     for source_m in panels.samples_m()[0]:
         clear = ~are_hidden(raised_m, source_m, boxes, 0.01)
         expected += clear * panels.direct(raised_m, normals, source_m) / 4

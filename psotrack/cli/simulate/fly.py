@@ -49,7 +49,7 @@ def fly(
     import numpy as np
 
     from psotrack.simulation import flight_space, write_recorded_flight
-    from psotrack.simulation.flights import devices, piloting
+    from psotrack.simulation.flights.piloting import fly, open_device, write_sticks
 
     sticks_path = out.with_suffix(".sticks.csv")
     check_suffix("--out", out, ".csv")
@@ -57,11 +57,11 @@ def fly(
     space = flight_space(hall)
     # Ctrl-C ends the flight, which is then written.
     with unhurried_end(), errors_name(device):
-        with devices.open_device(device, space) as (samples, watch):
+        with open_device(device, space) as (samples, watch):
             known: dict[str, Any] = {"rate_hz": rate_hz, "max_s": max_seconds, "watch": watch}
-            recorded, used = piloting.fly(samples, np.array(start_m), space, **known)
+            recorded, used = fly(samples, np.array(start_m), space, **known)
         write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
-        piloting.write_sticks(sticks_path, used)
+        write_sticks(sticks_path, used)
     output.say(
         f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s",
         f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}',

@@ -2,17 +2,27 @@
 
 The thrust of a multirotor acts along its body's z axis only, so this axis points along a + g (Mellinger and Kumar,
 "Minimum snap trajectory generation and control for quadrotors", 2011; drag is neglected). The heading is free.
-Flights from formulas (harmonics, relative and delayed flights, waypoints) have exact derivatives.
+Flights from formulas (harmonics, relative and delayed flights, waypoints) have exact derivatives. A quintic spline goes
+through the samples of a recorded flight, from motion capture, a tracker or `psotrack simulate fly`.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import BSpline, make_interp_spline, make_lsq_spline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings.exchange import read_tracks
+from psotrack.simulation.scenarios import FlightFromFile
+from psotrack.trajectories import Trajectories, write_trajectories
 
 GRAVITY_M_S2 = 9.81
 
@@ -188,3 +198,236 @@ class WaypointFlight(Flight):
         leg_m = (np.roll(self.points_m, -1, axis=0) - self.points_m)[leg]
         moved = (_MINIMUM_JERK[order](share) / moving_s**order)[:, None] * leg_m
         return self.points_m[leg] + moved if order == 0 else moved
+
+
+_DEGREE = 5
+#: Smallest number of samples for a quintic spline.
+MIN_SAMPLES = _DEGREE + 1
+#: Largest noise of the acceleration without smoothing; it tilts a drone by 3 degrees.
+_NOISE_M_S2 = 0.5
+#: Standard deviation of the second derivative of a quintic spline through white noise, times the squared spacing,
+#: divided by the standard deviation of the noise; found by simulation.
+_NOISE_GAIN = 3.84
+#: Smallest time, and smallest number of samples, between two knots.
+_KNOT_S = 0.25
+_SAMPLES_PER_KNOT = 3
+
+Samples = Float[np.ndarray, "samples"]
+Positions = Float[np.ndarray, "samples 3"]
+
+
+def spline(time_s: Samples, position_m: Positions) -> BSpline:
+    """Quintic spline through samples, or near samples with noise.
+
+    Args:
+        time_s: (samples,), increasing times of at least `MIN_SAMPLES` samples.
+        position_m: (samples, 3), world.
+
+    Returns:
+        Position over time, (times, 3).
+    """
+    # The shortest spacing, because two nearly simultaneous samples that differ give the largest acceleration.
+    spacing_s = float(np.diff(time_s).min())
+    if _NOISE_GAIN * _noise_m(time_s, position_m) / spacing_s**2 <= _NOISE_M_S2:
+        return make_interp_spline(time_s, position_m, k=_DEGREE)
+    first, last = (np.repeat(end, _DEGREE + 1) for end in (time_s[0], time_s[-1]))
+    return make_lsq_spline(time_s, position_m, np.concatenate([first, _knots_s(time_s), last]), k=_DEGREE)
+
+
+def _noise_m(time_s: Samples, position_m: Positions) -> float:
+    """Standard deviation, along the worst axis, of the samples' differences from the quintic through six neighbours."""
+    if len(time_s) <= MIN_SAMPLES:
+        return 0.0
+    window_s = np.lib.stride_tricks.sliding_window_view(time_s, 7)
+    window_m = np.lib.stride_tricks.sliding_window_view(position_m, 7, axis=0)
+    here_s, others = window_s[:, 3], [0, 1, 2, 4, 5, 6]
+    weights = np.zeros_like(window_s)
+    weights[:, 3] = -1.0
+    for j in others:
+        rest_s = window_s[:, [m for m in others if m != j]]
+        # Lagrange polynomials at the time of the middle sample.
+        weights[:, j] = np.prod((here_s[:, None] - rest_s) / (window_s[:, j, None] - rest_s), axis=1)
+    residual_m = np.einsum("nj,naj->na", weights, window_m) / np.linalg.norm(weights, axis=1, keepdims=True)
+    # The median ignores the few jerks of a person at the sticks, which are no noise. The median of the absolute value
+    # of a Gaussian is 0.6745 standard deviations.
+    return float(np.median(np.abs(residual_m), axis=0).max()) / 0.6745
+
+
+def _knots_s(time_s: Samples) -> Float[np.ndarray, "knots"]:
+    """(knots,), sample times with `_KNOT_S` and `_SAMPLES_PER_KNOT` between them, so that the fit is unique."""
+    knots: list[int] = []
+    index = 0
+    while True:
+        index = max(int(np.searchsorted(time_s, time_s[index] + _KNOT_S)), index + _SAMPLES_PER_KNOT)
+        if index + _SAMPLES_PER_KNOT >= len(time_s):
+            break
+        knots.append(index)
+    # The first and last interval are twice as long: with samples on one side only, the noise of the acceleration would
+    # be five times as large there.
+    knots = knots[1:-1]
+    return time_s[knots if len(knots) + MIN_SAMPLES <= len(time_s) else []]
+
+
+#: Largest time before the first and after the last sample that a flight is extrapolated to. It is longer than half an
+#: exposure, because the exposures of the first and last frame reach beyond the samples.
+_BEYOND_S = 0.1
+#: Tolerance for times of frames and times of samples, which come from different divisions.
+_ROUNDING_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Samples of a flight.
+
+    Attributes:
+        time_s: (samples,), increasing times.
+        position_m: (samples, 3), world.
+        orientation_wxyz: (samples, 4), unit quaternions that turn body into world coordinates, or None.
+    """
+
+    time_s: Float[np.ndarray, "samples"]
+    position_m: Float[np.ndarray, "samples 3"]
+    orientation_wxyz: Float[np.ndarray, "samples 4"] | None
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last sample."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+
+def read_recorded_flight(path: str | Path) -> Recorded:
+    """Read the flight of one drone from tracks in any format of `read_tracks`; rows without a position are left out.
+
+    Raises:
+        InputError: the file cannot be read, has no drone or several, fewer than `MIN_SAMPLES` positions, or positions
+            with and without an orientation.
+    """
+    tracks = read_tracks(path)
+    if tracks.num_drones != 1:
+        found = ", ".join(tracks.drones)
+        raise InputError(
+            path, expected="the flight of one drone", found=found, remedy="keep one drone's rows"
+        )
+    known = np.isfinite(tracks.position_m[:, 0]).all(axis=1)
+    if np.count_nonzero(known) < MIN_SAMPLES:
+        found = f"{np.count_nonzero(known)}"
+        raise InputError(path, expected=f"at least {MIN_SAMPLES} positions", found=found)
+    turned = None if tracks.orientation_wxyz is None else tracks.orientation_wxyz[known, 0]
+    if turned is not None and not np.isfinite(turned).all():
+        found = f"none at {tracks.time_s[known][~np.isfinite(turned).all(axis=1)][0]:g} s"
+        raise InputError(path, expected="an orientation with each position, or no orientations", found=found)
+    return Recorded(tracks.time_s[known], tracks.position_m[known, 0], turned)
+
+
+def write_recorded_flight(
+    path: str | Path,
+    time_s: Float[np.ndarray, "samples"],
+    position_m: Float[np.ndarray, "samples 3"],
+    orientation_wxyz: Float[np.ndarray, "samples 4"] | None,
+) -> None:
+    """Write the tracks of one drone, .csv or .parquet, with all digits, so that reading gives the same numbers.
+
+    Raises:
+        InputError: the path has another suffix.
+        OutputError: the file cannot be written; an existing file is unchanged.
+    """
+    turned = None if orientation_wxyz is None else orientation_wxyz[:, None]
+    frame = np.arange(len(time_s))
+    tracks = Trajectories(frame, time_s, ("dron1",), position_m[:, None], orientation_wxyz=turned)
+    write_trajectories(path, tracks, force=True)
+
+
+def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
+    """Read the recorded flight that a scenario names; `heading` is used if the file has no orientations.
+
+    Raises:
+        InputError: `read_recorded_flight` cannot read the file.
+        SettingsError: the recorded flight ends before `start_s`.
+    """
+    recorded = read_recorded_flight(record.file)
+    if record.start_s >= recorded.duration_s:
+        raise SettingsError(
+            f"start_s of {record.file}",
+            expected=f"less than its duration, {recorded.duration_s:g} s",
+            found=f"{record.start_s:g}",
+        )
+    return RecordedFlight(recorded, heading, record.start_s, np.array(record.offset_m), record.file)
+
+
+@dataclass(frozen=True)
+class RecordedFlight(Flight):
+    """A recorded flight that is replayed.
+
+    The flight is extrapolated by a short time before the first and after the last sample, for the exposures of the
+    first and last frame. Times further outside raise `SettingsError`; the message says how many times are inside.
+
+    Attributes:
+        recorded: samples of the flight.
+        heading: heading for samples without orientations; their attitude follows from the acceleration.
+        start_s: time after the first sample that becomes the flight's time 0.
+        offset_m: (3,), vector that is added to the positions.
+        name: name for messages.
+    """
+
+    recorded: Recorded
+    heading: Heading
+    start_s: float
+    offset_m: Float[np.ndarray, "3"]
+    name: str
+
+    @cached_property
+    def _splines(self) -> tuple[BSpline, BSpline, BSpline]:
+        """Position, velocity and acceleration over the time of the samples."""
+        position = spline(self.recorded.time_s, self.recorded.position_m)
+        return position, position.derivative(1), position.derivative(2)
+
+    @cached_property
+    def _attitude(self) -> RotationSpline | None:
+        orientation_wxyz = self.recorded.orientation_wxyz
+        if orientation_wxyz is None:
+            return None
+        return RotationSpline(self.recorded.time_s, Rotation.from_quat(orientation_wxyz, scalar_first=True))
+
+    def check(self, time_s: Times) -> None:
+        """Raise `SettingsError` if a given time of a frame is outside the samples."""
+        self._own_time(time_s, _ROUNDING_S)
+
+    def _own_time(
+        self, time_s: Times, beyond_s: float = _BEYOND_S
+    ) -> tuple[Times, Float[np.ndarray, "times 1"]]:
+        """Times within the samples that are nearest to the given times, and the differences to the given times."""
+        samples_s = self.recorded.time_s
+        first_s = self.start_s + float(np.min(time_s, initial=0.0))
+        if first_s < -beyond_s:
+            raise SettingsError(
+                self.name,
+                expected=f"a start_s of at least {self.start_s - first_s:.6g} s",
+                found=f"{self.start_s:.6g} s",
+                remedy="the drone that follows with a delay begins at an earlier point of the recording",
+            )
+        own_s = samples_s[0] + self.start_s + time_s
+        inside_s = np.clip(own_s, samples_s[0], samples_s[-1])
+        fit = np.abs(own_s - inside_s) <= beyond_s
+        if not fit.all():
+            raise SettingsError(
+                self.name,
+                expected=f"a recording of at least {self.start_s + float(np.max(time_s)):.6g} s",
+                found=f"{self.recorded.duration_s:.6g} s",
+                remedy=f"{np.count_nonzero(fit)} of the {len(fit)} frames would fit",
+            )
+        return inside_s, (own_s - inside_s)[:, None]
+
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3), by a Taylor series from the nearest time within the samples."""
+        own_s, beyond_s = self._own_time(time_s)
+        terms = (
+            curve(own_s) * beyond_s**power / math.factorial(power)
+            for power, curve in enumerate(self._splines[order:])
+        )
+        return sum(terms, self.offset_m * (order == 0))
+
+    def rotation(self, time_s: Times) -> Float[np.ndarray, "times 3 3"]:
+        """(times, 3, 3), body to world: as recorded, or from the acceleration if no orientations were recorded."""
+        if self._attitude is None:
+            return super().rotation(time_s)
+        return self._attitude(self._own_time(time_s)[0]).as_matrix()

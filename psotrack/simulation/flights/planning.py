@@ -1,10 +1,16 @@
-"""Flights of a scenario for a seed, varied until they keep the scenario's limits."""
+"""Flights of a scenario for a seed: made from its records, varied at random until they keep the scenario's limits.
+
+All formulas are written as sums of harmonics, so that the same random numbers apply to all of them: a change of phase,
+size and period of each harmonic, and a change of the centre. Drones of one group have the same random numbers, except
+for the heading.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,23 +18,276 @@ from jaxtyping import Float
 from numpy.linalg import norm
 
 from psotrack.errors import SettingsError
-from psotrack.simulation.flights.motion import Flight
-from psotrack.simulation.flights.recordings import recorded_flight
-from psotrack.simulation.flights.varying import (
-    Turn,
-    check_records,
-    draws,
-    flying_order,
-    make,
-    make_heading,
-    zero_draws,
+from psotrack.simulation.flights.motion import (
+    DelayedFlight,
+    Flight,
+    HarmonicFlight,
+    Heading,
+    RelativeFlight,
+    WaypointFlight,
+    recorded_flight,
 )
 from psotrack.simulation.scenarios import (
+    Crossing,
+    Drone,
     FlightFromFile,
+    FlightRecord,
+    FollowingFlight,
+    Formation,
+    Harmonics,
     NearPass,
+    Orbit,
     Scenario,
+    Variation,
+    Vector,
+    Waypoints,
     scenario_error,
 )
+
+#: Largest cosine of the angle between a near pass's side and its swing, which should be perpendicular. The relative
+#: error of the distance is half of the cosine's square, which is negligible.
+_PERPENDICULAR = 1e-6
+
+
+def followed(record: FlightRecord) -> tuple[str, int] | None:
+    """Field and number of the drone that a flight is relative to; None for an independent flight."""
+    if isinstance(record, Formation | FollowingFlight):
+        return "leader", record.leader
+    if isinstance(record, NearPass):
+        return "other", record.other
+    return None
+
+
+def flying_order(scenario: Scenario) -> tuple[int, ...]:
+    """Indices of the drones in an order in which each drone comes after the drone that its flight is relative to.
+
+    Raises:
+        SettingsError: a flight is relative to a drone that does not exist, or, along a chain, to itself.
+    """
+    order: list[int] = []
+    for index in range(len(scenario.drones)):
+        chain = _chain(scenario, index)
+        order += [link for link in reversed(chain) if link not in order]
+    return tuple(order)
+
+
+def _chain(scenario: Scenario, index: int) -> list[int]:
+    """Index of a drone, then of the drone that its flight is relative to, and so on along the chain."""
+    chain, count = [index], len(scenario.drones)
+    while relation := followed(scenario.drones[chain[-1]].flight):
+        name, number = relation
+        field = f"drones[{chain[-1]}].flight.{name}"
+        if number > count:
+            raise scenario_error(scenario, field, f"a drone's number, 1 to {count}", number)
+        chain.append(number - 1)
+        if chain[-1] in chain[:-1]:
+            loop = " -> ".join(f"{link + 1}" for link in chain)
+            raise scenario_error(scenario, field, "relative flights without a cycle", f"drones {loop}")
+    return chain
+
+
+def check_records(scenario: Scenario) -> None:
+    """Refuse near passes and waypoints that are impossible for every seed.
+
+    Raises:
+        SettingsError: a near pass has no side or no swing, or its side is not perpendicular to its swing; the speed
+            between waypoints is above the limit, or two consecutive waypoints are equal. The message names the field.
+    """
+    for index, drone in enumerate(scenario.drones):
+        if isinstance(drone.flight, NearPass):
+            _check_near_pass(scenario, f"drones[{index}].flight", drone.flight)
+        elif isinstance(drone.flight, Waypoints):
+            _check_waypoints(scenario, f"drones[{index}].flight", drone.flight)
+
+
+def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
+    for name, vector in (("side", record.side), ("swing_m", record.swing_m)):
+        if not np.any(vector):
+            raise scenario_error(scenario, f"{field}.{name}", "a direction", "[0, 0, 0]")
+    side, swing = (np.array(vector) / np.linalg.norm(vector) for vector in (record.side, record.swing_m))
+    cosine = float(side @ swing)
+    if abs(cosine) > _PERPENDICULAR:
+        found = f"one at {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.4g} degrees to it"
+        remedy = "otherwise distance_m is not the smallest distance"
+        raise scenario_error(scenario, f"{field}.side", "a direction perpendicular to swing_m", found, remedy)
+
+
+def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
+    # A fast drone could reach the next waypoint between two frames, where the limits are not checked.
+    most_m_s = scenario.limits.max_speed_m_s
+    if record.speed_m_s > most_m_s:
+        expected = f"at most {most_m_s:g} m/s (limits.max_speed_m_s)"
+        raise scenario_error(scenario, f"{field}.speed_m_s", expected, f"{record.speed_m_s:g}")
+    for index, point_m in enumerate(record.points_m):
+        if point_m == record.points_m[index - 1]:
+            expected = "a point that differs from the previous one (the first point follows the last)"
+            found, remedy = f"{list(point_m)} again", "to stand still at a point, set hover_s"
+            raise scenario_error(scenario, f"{field}.points_m[{index}]", expected, found, remedy)
+
+
+#: Records of flights that are sums of harmonics.
+HarmonicRecord = Harmonics | Orbit | Crossing | Formation | NearPass
+Point = Vector | Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Random numbers from -1 to 1 for one flight; the scenario's variation multiplies them.
+
+    Attributes:
+        phase: (harmonics,), changes of the phases.
+        centre: (3,), change of the centre.
+        size: (harmonics,), changes of the amplitudes.
+        period: (harmonics,), changes of the periods.
+        points: (points, 3), changes of the waypoints.
+    """
+
+    phase: Float[np.ndarray, "harmonics"]
+    centre: Float[np.ndarray, "3"]
+    size: Float[np.ndarray, "harmonics"]
+    period: Float[np.ndarray, "harmonics"]
+    points: Float[np.ndarray, "points 3"]
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Random numbers for a heading.
+
+    Attributes:
+        yaw: change of the mean heading, -1 to 1; the scenario's variation multiplies it.
+        sway_phase_rad: phase of the change of heading at time 0.
+    """
+
+    yaw: float = 0.0
+    sway_phase_rad: float = 0.0
+
+
+Draws = tuple[tuple[Draw, Turn], ...]
+
+
+def zero_draws(scenario: Scenario) -> Draws:
+    """Zeros for each drone, which leave the scenario's flights unchanged."""
+    return tuple((_draw([drone], lambda *shape: np.zeros(shape)), Turn()) for drone in scenario.drones)
+
+
+def draws(scenario: Scenario, rng: np.random.Generator) -> Draws:
+    """Random numbers for each drone; drones of one group have the same numbers, except for the heading."""
+    drawn: dict[str | int, Draw] = {}
+    result = []
+    for index, drone in enumerate(scenario.drones):
+        members = (
+            [other for other in scenario.drones if other.group == drone.group] if drone.group else [drone]
+        )
+        group = drone.group or index
+        if group not in drawn:
+            drawn[group] = _draw(members, lambda *shape: rng.uniform(-1, 1, shape))
+        turn = Turn(float(rng.uniform(-1, 1)), float(rng.uniform(0, 2 * np.pi)))
+        result.append((drawn[group], turn))
+    return tuple(result)
+
+
+def _draw(drones: Sequence[Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
+    """Random numbers for drones of one group, enough for the flight with the most harmonics or waypoints."""
+    harmonics = max(_num_harmonics(drone.flight) for drone in drones)
+    points = max(len(drone.flight.points_m) if isinstance(drone.flight, Waypoints) else 0 for drone in drones)
+    return Draw(uniform(harmonics), uniform(3), uniform(harmonics), uniform(harmonics), uniform(points, 3))
+
+
+def _num_harmonics(record: FlightRecord) -> int:
+    if isinstance(record, FlightFromFile | FollowingFlight):
+        return 0
+    # A flight through waypoints uses one number: the change of its period.
+    return 1 if isinstance(record, Waypoints) else len(_harmonics(record)[1])
+
+
+def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tuple[Flight, ...]:
+    """Make the flight of each drone, changed by its random numbers.
+
+    Args:
+        scenario: the scenario.
+        drawn: random numbers of each drone.
+        recorded: recorded flights by the index of their drone; these flights do not change.
+
+    Raises:
+        SettingsError: a flight is relative to a drone that does not exist or, along a chain, to itself.
+    """
+    made: dict[int, Flight] = {}
+    for index in flying_order(scenario):
+        drone, (draw, turn) = scenario.drones[index], drawn[index]
+        heading = make_heading(drone, turn, scenario.variation)
+        match drone.flight:
+            case FlightFromFile():
+                made[index] = recorded[index]
+            case FollowingFlight(leader=leader, delay_s=delay_s):
+                made[index] = DelayedFlight(made[leader - 1], delay_s, heading)
+            case Formation(leader=other) | NearPass(other=other) as record:
+                # Offset and distance that the scenario gives are not varied.
+                unmoved = replace(draw, centre=np.zeros(3))
+                offset = _harmonic_flight(record, unmoved, scenario.variation, heading)
+                made[index] = RelativeFlight(made[other - 1], offset, heading)
+            case Waypoints() as record:
+                made[index] = _waypoint_flight(record, draw, scenario.variation, heading)
+            case record:
+                made[index] = _harmonic_flight(record, draw, scenario.variation, heading)
+    return tuple(made[index] for index in range(len(scenario.drones)))
+
+
+def make_heading(drone: Drone, turn: Turn, variation: Variation) -> Heading:
+    """Heading of a drone over time, changed by its random numbers."""
+    return Heading(
+        float(np.radians(drone.yaw_deg + turn.yaw * variation.yaw_deg)),
+        float(np.radians(drone.yaw_sway_deg)),
+        2 * np.pi / drone.yaw_period_s,
+        turn.sway_phase_rad,
+    )
+
+
+def _harmonic_flight(
+    record: HarmonicRecord, draw: Draw, variation: Variation, heading: Heading
+) -> HarmonicFlight:
+    centre_m, terms = _harmonics(record)
+    count = len(terms)
+    amplitude_m, phase_deg = (np.array([term[i] for term in terms], float).reshape(-1, 3) for i in (0, 2))
+    period_s = np.array([term[1] for term in terms], float)
+    return HarmonicFlight(
+        centre_m=np.array(centre_m, float) + draw.centre * variation.centre_m,
+        amplitude_m=amplitude_m * (1 + variation.size * draw.size[:count])[:, None],
+        angular_rad_s=2 * np.pi / (period_s * (1 + variation.period * draw.period[:count])),
+        # All axes of a harmonic get the same change of phase, so that an orbit stays an orbit.
+        phase_rad=np.radians(phase_deg + (variation.phase_deg * draw.phase[:count])[:, None]),
+        heading=heading,
+    )
+
+
+def _waypoint_flight(record: Waypoints, draw: Draw, variation: Variation, heading: Heading) -> WaypointFlight:
+    points_m = np.array(record.points_m, np.float64)
+    points_m = points_m + draw.points[: len(points_m)] * variation.centre_m
+    leg_m = np.linalg.norm(np.roll(points_m, -1, axis=0) - points_m, axis=-1)
+    slower = float(1 + variation.period * draw.period[0])
+    return WaypointFlight(points_m, leg_m / record.speed_m_s * slower, record.hover_s * slower, heading)
+
+
+def _harmonics(record: HarmonicRecord) -> tuple[Point, list[tuple[Point, float, Point]]]:
+    """Centre, and amplitude, period and phases of each term; of a formation or near pass, from the other drone."""
+    match record:
+        case Harmonics():
+            return record.centre_m, [(one.amplitude_m, one.period_s, one.phase_deg) for one in record.terms]
+        case Orbit():
+            across = 180.0 if record.clockwise else 0.0
+            phases_deg = (record.phase_deg + 90.0, record.phase_deg + across, 0.0)
+            about = (*record.radius_m, 0.0), record.period_s, phases_deg
+            rise = (0.0, 0.0, record.rise_m), record.rise_period_s, (0.0, 0.0, record.rise_phase_deg)
+            return record.centre_m, [about, rise]
+        case Crossing():
+            start, end = np.array(record.start_m), np.array(record.end_m)
+            to_and_fro = (end - start) / 2, record.period_s, (record.phase_deg - 90.0,) * 3
+            return (start + end) / 2, [to_and_fro]
+        case Formation():
+            return record.offset_m, []
+        case NearPass():
+            side = np.array(record.side) / np.linalg.norm(record.side)
+            swing = record.swing_m, record.period_s, (record.phase_deg,) * 3
+            return side * record.distance_m, [swing]
 
 
 class Excess(NamedTuple):

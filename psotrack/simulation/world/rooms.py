@@ -1,19 +1,167 @@
-"""Rooms: textured rectangles (floor, walls, ceiling, furniture, markers) with light in their textures."""
+"""Rooms: halls from `halls.toml` with their camera rigs, textured rectangles, and light in their textures."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
+from typing import Literal
 
 import cv2
+import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from psotrack.simulation.scenarios import Vector
+from psotrack.simulation.scenarios import CameraPlace, Vector
 from psotrack.simulation.world import textures
-from psotrack.simulation.world.halls import HALLS, Box, Hall
-from psotrack.simulation.world.lighting import Lamps, bake, lamps
+
+
+class Box(msgspec.Struct, frozen=True, array_like=True):
+    """A box with the colour `bgr` (linear reflectance): a piece of furniture or a part of it."""
+
+    lower_m: Vector
+    upper_m: Vector
+    bgr: Vector
+
+
+class Hall(msgspec.Struct, frozen=True):
+    """Plan of a hall around the origin, with the floor at z = 0.
+
+    Attributes:
+        size_m: length along x, length along y, and height.
+        lamps_xy_m: centres of the lamp panels in the ceiling.
+        lamp_size_m: size of each panel along x and y.
+        markers: numbers of ArUco markers on the walls at y > 0, x > 0, y < 0 and x < 0; ids start at 1 in this order.
+        marker_size_m: side of a marker's black square.
+        texel_m: texel size of floor and walls at full size; about a pixel at the smallest distance of a drone.
+        light_step_m: step of the lightmaps; it can be large, because the large panels make soft shadows.
+        floor, ceiling, walls: names of the functions of `textures` that draw them.
+        boxes: furniture.
+        seed: seed of the textures.
+    """
+
+    size_m: Vector
+    lamps_xy_m: tuple[tuple[float, float], ...]
+    lamp_size_m: tuple[float, float]
+    markers: tuple[int, int, int, int]
+    marker_size_m: float
+    texel_m: float
+    light_step_m: float
+    floor: Literal["floor", "slab"]
+    ceiling: Literal["ceiling", "sheeting"]
+    walls: Literal["wall", "cladding"]
+    boxes: tuple[Box, ...]
+    seed: int
+
+
+class _Plans(msgspec.Struct, frozen=True):
+    halls: dict[str, Hall]
+    rigs: dict[str, tuple[CameraPlace, ...]]
+
+
+_PLANS = msgspec.toml.decode(
+    resources.files("psotrack.simulation.world").joinpath("halls.toml").read_bytes(), type=_Plans
+)
+HALLS: Mapping[str, Hall] = _PLANS.halls
+RIGS: Mapping[str, tuple[CameraPlace, ...]] = {
+    "laboratory": _PLANS.rigs["laboratory"],
+    "laboratory_corners": _PLANS.rigs["laboratory"][:4],
+    "large_hall": _PLANS.rigs["large_hall"],
+}
+
+
+#: Share of ambient light. The share is large, because walls and ceiling of a bright room reflect much light.
+AMBIENT = 0.4
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """Equal panels in the ceiling that shine downwards.
+
+    Attributes:
+        centres_m: (lamps, 3), centres of the panels.
+        size_m: size of each panel along x and along y.
+        exposure: factor of the light; with the right factor, a white horizontal face in the middle of the floor is 1.
+    """
+
+    centres_m: Float[np.ndarray, "lamps 3"]
+    size_m: tuple[float, float]
+    exposure: float
+
+    def samples_m(self) -> Float[np.ndarray, "lamps samples 3"]:
+        """(lamps, 4, 3), points on each panel, for soft shadows."""
+        spread = np.array([(-1, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)]) * [*self.size_m, 0.0] / 4
+        return self.centres_m[:, None] + spread
+
+    def direct(
+        self,
+        points_m: Float[np.ndarray, "*points 3"],
+        normals: Float[np.ndarray, "*points 3"],
+        source_m: Float[np.ndarray, "3"],
+    ) -> Float[np.ndarray, "*points"]:
+        """Light on faces from one point of a panel: Lambert's law at the panel and at the face, inverse square law."""
+        towards = source_m - points_m
+        distance = np.linalg.norm(towards, axis=-1)
+        towards = towards / distance[..., None]
+        received = np.clip((towards * normals).sum(axis=-1), 0, None)
+        return self.exposure * received * np.clip(towards[..., 2], 0, None) / distance**2
+
+    def on_faces(
+        self, at_m: Float[np.ndarray, "3"], normals: Float[np.ndarray, "faces 3"]
+    ) -> Float[np.ndarray, "faces"]:
+        """Light on the faces of a small object at `at_m`, without shadows."""
+        points = np.broadcast_to(at_m, normals.shape)
+        direct = sum((self.direct(points, normals, lamp) for lamp in self.centres_m), np.zeros(len(normals)))
+        # Faces that point down receive light of the floor, which is darker than walls and ceiling.
+        return direct + AMBIENT * (0.75 + 0.25 * normals[:, 2])
+
+
+def lamps(centres_m: Float[np.ndarray, "lamps 3"], size_m: tuple[float, float]) -> Lamps:
+    """Panels with the exposure that gives 1 for white in the middle of the floor, ambient light included."""
+    plain = Lamps(centres_m, size_m, 1.0)
+    up = np.array([[0.0, 0.0, 1.0]])
+    middle = sum(float(plain.direct(np.zeros((1, 3)), up, lamp)[0]) for lamp in centres_m)
+    return Lamps(centres_m, size_m, (1.0 - AMBIENT) / middle)
+
+
+def bake(
+    points_m: Float[np.ndarray, "rows columns 3"],
+    normal: Float[np.ndarray, "3"],
+    panels: Lamps,
+    boxes_m: Float[np.ndarray, "boxes 2 3"],
+) -> Float[np.ndarray, "rows columns"]:
+    """Light at a regular grid of points on one face, with shadows of boxes."""
+    raised = points_m + 2e-3 * normal
+    normals = np.broadcast_to(normal, points_m.shape)
+    # Boxes behind the plane cast no shadow on it.
+    reach_m = np.where(normal > 0, boxes_m[:, 1], boxes_m[:, 0]) - points_m[0, 0]
+    before = boxes_m[reach_m @ normal > 1e-9]
+    light = np.zeros(points_m.shape[:2])
+    for panel in panels.samples_m():
+        for source in panel:
+            if (source - points_m[0, 0]) @ normal > 0:
+                seen = ~_blocked(raised, source, before).any(axis=0)
+                light += seen * panels.direct(raised, normals, source) / len(panel)
+    return light + AMBIENT * (0.85 + 0.15 * normal[2])
+
+
+def _blocked(
+    points_m: Float[np.ndarray, "rows columns 3"],
+    source_m: Float[np.ndarray, "3"],
+    boxes_m: Float[np.ndarray, "boxes 2 3"],
+) -> Bool[np.ndarray, "boxes rows columns"]:
+    """Whether a box stands between a point and the source (slab test, Kay and Kajiya, 1986)."""
+    enter, leave = -np.inf, np.inf
+    for axis in range(3):
+        start = points_m[..., axis]
+        ray = source_m[axis] - start
+        ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
+        a, b = ((boxes_m[:, side, axis, None, None] - start) / ray for side in range(2))
+        enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
+    # A point on the box itself touches the box at 0, which does not count as blocked.
+    return (enter < leave) & (leave > 1e-3) & (enter < 1) & (leave > np.maximum(enter, 0) + 1e-3)
+
 
 MARKER_DICTIONARY = cv2.aruco.DICT_4X4_1000
 #: Largest factor of the texel size for small images.

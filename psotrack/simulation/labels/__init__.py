@@ -1,1 +1,0 @@
-"""Labels of the frames: masks and detections."""
