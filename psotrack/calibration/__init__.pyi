@@ -2,11 +2,6 @@ from .board_recognition import BoardFinder, describe_board, detect_board
 from .boards import Board, save_board
 from .bundle import GATE, Bundle, BundleProblem, BundleState, KnownLens, spread_px, summed
 from .extrinsics import Located, Solver, locate_camera, ray_distances, solve_pnp, solve_pnp_ransac
-from .image_points import (
-    ImagePoints,
-    find_markers,
-    read_image_points,
-)
 from .lens_models import LensModel, known_lenses, lens_of_view, parse_lens_model
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, start_lenses
 from .rig.by_board import calibrate_by_board
@@ -21,12 +16,14 @@ from .rig.findings import (
     say_searched,
     worst_views,
 )
-from .rig.lenses import choose_lens_model
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.point_files import (
     GivenWorld,
+    ImagePoints,
     distance_between,
+    find_markers,
     fit_world,
+    read_image_points,
     read_point_views,
     read_world,
     stick_length,
@@ -34,6 +31,7 @@ from .rig.point_files import (
 )
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.shifts import Shift, find_board_shifts, find_point_shifts
+from .rig.start import choose_lens_model
 from .rig.views import (
     BoardViews,
     CameraImages,

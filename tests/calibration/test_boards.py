@@ -26,7 +26,7 @@ from psotrack.calibration import (
     say_print,
 )
 from psotrack.calibration.board_recognition import missing_board, recognise_board
-from psotrack.calibration.rig.lenses import find_lens, fit_boards
+from psotrack.calibration.rig.start import find_lens, fit_boards
 from psotrack.geometry import make_camera, make_rig
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings.datasets import open_recording

@@ -16,8 +16,14 @@ from scipy.stats import multivariate_normal
 
 import psotrack as pt
 from psotrack.calibration.doctor import examine, fault_search
-from psotrack.calibration.doctor.common_points import CommonPoints
-from psotrack.calibration.doctor.corrections import PER_CAMERA, Corrected, WeightedPoints, linearise, weigh
+from psotrack.calibration.doctor.common_points import (
+    PER_CAMERA,
+    CommonPoints,
+    Corrected,
+    WeightedPoints,
+    linearise,
+    weigh,
+)
 from psotrack.geometry import Rig
 from psotrack.recordings import Detections
 from psotrack.tracking.matching import from_detections

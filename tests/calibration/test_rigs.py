@@ -42,7 +42,7 @@ from psotrack.calibration import (
     views_of_detections,
     world_of_camera,
 )
-from psotrack.calibration.rig.lenses import find_board_poses, fit_boards
+from psotrack.calibration.rig.start import find_board_poses, fit_boards
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections, FrameTimes
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, make_rig, project, reconstruct
 from psotrack.geometry.rig_files import KEYS, read_lenses, read_rig, write_rig
-from psotrack.geometry.rig_files.vicon import fit_distortion
+from psotrack.geometry.rig_files.xml_files import fit_distortion
 from psotrack.recordings import CameraTable
 
 #: Files of other programs, which have the cameras of `poses`, and those that each program reads with it.

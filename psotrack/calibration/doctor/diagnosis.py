@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack.calibration.doctor.corrections import Corrected
+from psotrack.calibration.doctor.common_points import Corrected
 from psotrack.calibration.doctor.fault_search import FoundFault, Judged
 from psotrack.geometry import Camera, Rig
 from psotrack.support import finite_or_none, html_block, html_table, text_table

@@ -14,9 +14,10 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames
-from psotrack.calibration.doctor.corrections import (
+from psotrack.calibration.doctor.common_points import (
+    CommonPoints,
     Corrected,
+    ExaminedFrames,
     WeightedPoints,
     linearise,
     medians,

@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp
 
-from psotrack.calibration.doctor.corrections import (
+from psotrack.calibration.doctor.common_points import (
     PER_CAMERA,
     Corrected,
     WeightedPoints,

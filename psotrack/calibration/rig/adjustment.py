@@ -38,8 +38,14 @@ from psotrack.calibration.bundle import (
     summed,
 )
 from psotrack.calibration.lens_models import LensModel
-from psotrack.calibration.rig.chain import Chain, join_cameras
-from psotrack.calibration.rig.lenses import LEAST_VIEWS, MOST_FITS, choose_lens_model, find_lens
+from psotrack.calibration.rig.start import (
+    LEAST_VIEWS,
+    MOST_FITS,
+    Chain,
+    choose_lens_model,
+    find_lens,
+    join_cameras,
+)
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.calibration.extrinsics import locate_camera
-from psotrack.calibration.image_points import find_markers, read_image_points
 from psotrack.calibration.lens_models import lens_of_view, lenses_at_size
 from psotrack.calibration.rig.findings import RigCalibration
 from psotrack.calibration.rig.moving_point import (
@@ -23,7 +22,9 @@ from psotrack.calibration.rig.moving_point import (
 )
 from psotrack.calibration.rig.point_files import (
     distance_between,
+    find_markers,
     fit_world,
+    read_image_points,
     read_point_views,
     read_world,
     stick_length,

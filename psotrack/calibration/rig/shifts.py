@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from psotrack.calibration.boards import Board
 from psotrack.calibration.extrinsics import solve_pnp_ransac
 from psotrack.calibration.lens_models import LensModel
-from psotrack.calibration.rig.lenses import find_board_poses
 from psotrack.calibration.rig.moving_point import PointViews
+from psotrack.calibration.rig.start import find_board_poses
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.geometry import Rig, project, triangulate_linearly, undistort
 from psotrack.support import similarity

@@ -10,7 +10,7 @@ from .formats import (
     rescale_lenses,
     write_rig,
 )
-from .rig_toml import KEYS, fields_of_table
+from .toml_files import KEYS, fields_of_table
 
 __all__ = [
     "KEYS",

@@ -17,18 +17,7 @@ import numpy as np
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Camera, Rig, make_rig, scale_lens
-from psotrack.geometry.rig_files import (
-    camera_tables,
-    dpjait_calibration,
-    easymocap,
-    kalibr,
-    number_tables,
-    opencv_storage,
-    qualisys,
-    rig_toml,
-    text_blocks,
-    vicon,
-)
+from psotrack.geometry.rig_files import dpjait_calibration, number_files, toml_files, xml_files, yaml_files
 from psotrack.geometry.rig_files.dpjait_calibration import write_calibration
 from psotrack.geometry.rig_files.fields import UNITS_M, CameraFields, Entry
 from psotrack.support import read_text, read_toml, refuse_to_overwrite
@@ -56,22 +45,20 @@ class _Format:
 
 #: Formats by the name that `--format` takes; the first that recognises a file is taken.
 _OF_TOML: Mapping[str, _Format] = {
-    "rig": _Format(rig_toml.read, rig_toml.recognises, rig_toml.write),
-    "caliscope": _Format(
-        camera_tables.read_metres, camera_tables.is_caliscope, camera_tables.write_caliscope
-    ),
-    "pose2sim": _Format(camera_tables.read_metres, camera_tables.is_pose2sim),
-    "anipose": _Format(camera_tables.read_anipose, lambda tables: True, camera_tables.write_anipose),
+    "rig": _Format(toml_files.read_rig_toml, toml_files.is_rig_toml, toml_files.write_rig_toml),
+    "caliscope": _Format(toml_files.read_metres, toml_files.is_caliscope, toml_files.write_caliscope),
+    "pose2sim": _Format(toml_files.read_metres, toml_files.is_pose2sim),
+    "anipose": _Format(toml_files.read_anipose, lambda tables: True, toml_files.write_anipose),
 }
 _OF_TEXT: Mapping[str, _Format] = {
-    "qualisys": _Format(qualisys.read, qualisys.recognises),
-    "vicon": _Format(vicon.read, vicon.recognises),
-    "easymocap": _Format(easymocap.read, easymocap.recognises),
-    "kalibr": _Format(kalibr.read, kalibr.recognises),
-    "handpose3d": _Format(text_blocks.read, text_blocks.recognises),
-    "argus": _Format(number_tables.read_argus, number_tables.is_argus),
-    "dlt": _Format(number_tables.read_dlt, number_tables.is_dlt),
-    "opencv": _Format(opencv_storage.read, opencv_storage.recognises, opencv_storage.write),
+    "qualisys": _Format(xml_files.read_qualisys, xml_files.is_qualisys),
+    "vicon": _Format(xml_files.read_vicon, xml_files.is_vicon),
+    "easymocap": _Format(yaml_files.read_easymocap, yaml_files.is_easymocap),
+    "kalibr": _Format(yaml_files.read_kalibr, yaml_files.is_kalibr),
+    "handpose3d": _Format(number_files.read_handpose3d, number_files.is_handpose3d),
+    "argus": _Format(number_files.read_argus, number_files.is_argus),
+    "dlt": _Format(number_files.read_dlt, number_files.is_dlt),
+    "opencv": _Format(yaml_files.read_opencv, yaml_files.is_opencv, yaml_files.write_opencv),
     "dpjait": _Format(dpjait_calibration.read, dpjait_calibration.recognises, write_calibration),
 }
 _FORMATS = {**_OF_TOML, **_OF_TEXT}
@@ -249,7 +236,7 @@ def write_rig(
     if write is None:
         raise SettingsError("format", expected=f"one of {', '.join(WRITTEN_RIG_FORMATS)}", found=name)
     refuse_to_overwrite(path, force)
-    write(path, rig) if placed else rig_toml.write(path, rig, placed=False)
+    write(path, rig) if placed else toml_files.write_rig_toml(path, rig, placed=False)
 
 
 def _format_of_name(path: Path) -> str:

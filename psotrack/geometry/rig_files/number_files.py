@@ -1,4 +1,4 @@
-"""Tables of nothing but numbers: DLT coefficients, and Argus's profile of lenses.
+"""Text files of numbers: DLT coefficients, Argus's profile of lenses, and the blocks of handpose3d.
 
 Direct linear transformation (DLT) has 11 coefficients per camera, as DLTdv, easyWand and Argus write them:
 
@@ -22,6 +22,11 @@ t2, k3 are OpenCV's k1, k2, p1, p2, k3. The format: `docs/user-guide.md` of the 
 r2, r4, r6). Argus takes cy and t1 for pixels counted upwards where it undistorts clicked points
 (`tools.undistort_pts`), but estimates them on images, downwards (`patterns`). Here they are those of images; the two
 differ only if cy is not in the middle or t1 is not 0. Argus undistorts with fx alone; AR is 1 in its profiles.
+
+**handpose3d** has blocks `intrinsic:`, `distortion:`, `R:` and `T:`, each followed by lines of numbers.
+
+`c0.dat` has the lens of the first camera, `rot_trans_c0.dat` beside it the pose, x_cam = R X + T; the unit is open. All
+cameras of the folder are read. A second `R:` and `T:`, from the first camera to this one, is left alone.
 """
 
 from __future__ import annotations
@@ -36,12 +41,14 @@ from scipy.linalg import rq
 
 from psotrack.errors import InputError
 from psotrack.geometry.rig_files.fields import CameraFields
-from psotrack.support import are_numbers
+from psotrack.support import are_numbers, read_text
 
 _COEFFICIENTS = 11
 #: Largest condition number of the 3 x 3 part. That of a camera is below the square of its focal length in pixels.
 _LARGEST_CONDITION = 1e12
 _ARGUS = ("camera", "fx", "w", "h", "cx", "cy", "AR", "k1", "k2", "t1", "t2", "k3")
+_POSE = "rot_trans_"
+_KEYS = {"intrinsic": "K", "distortion": "D", "R": "R", "T": "t"}
 
 
 def is_dlt(text: str) -> bool:
@@ -127,3 +134,45 @@ def _numbers(text: str) -> tuple[Float[np.ndarray, "rows columns"], Sequence[str
     if not rows or len({len(row) for row in rows}) > 1 or not all(map(are_numbers, rows)):
         return np.zeros((0, 0)), header
     return np.array(rows, np.float64), header
+
+
+def is_handpose3d(text: str) -> bool:
+    """Whether a text has such blocks."""
+    return bool(re.match(r"\s*(intrinsic|R):", text)) and bool(re.search(r"^(distortion|T):", text, re.M))
+
+
+def read_handpose3d(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read the cameras of a folder; the unit of length is open."""
+    folder, suffix = path.parent, path.suffix
+    numbered = re.compile(rf"(?:{_POSE})?(\w*?\d+){re.escape(suffix)}")
+    stems = {match[1] for each in folder.iterdir() if (match := numbered.fullmatch(each.name))}
+    stems |= {path.stem.removeprefix(_POSE)}
+    for stem in sorted(stems, key=lambda stem: (len(stem), stem)):
+        paths = [folder / f"{prefix}{stem}{suffix}" for prefix in ("", _POSE)]
+        values: dict[str, object] = {}
+        for each in paths:
+            values |= _blocks(each) if each.exists() else {}
+        if values:
+            # Videos of handpose3d are named cam0, its calibrations c0.
+            name = f"cam{stem[1:]}" if re.fullmatch(r"c\d+", stem) else stem
+            yield CameraFields(paths[0], "", values, name)
+
+
+def _blocks(path: Path) -> dict[str, object]:
+    found: dict[str, list[list[float]]] = {}
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.split()
+        if not words or line.startswith("#"):
+            continue
+        if words[0].endswith(":"):
+            rows = []
+            found.setdefault(_KEYS.get(words[0].rstrip(":"), ""), rows)
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            where = f"{path}, line {number}"
+            raise InputError(where, expected="numbers", found=repr(line[:60])) from None
+    found.pop("", None)
+    return {key: value[0] if key == "D" and value else value for key, value in found.items()}

@@ -1,7 +1,16 @@
-"""Calibrations of Vicon (`.xcp`, XML).
+"""Calibrations in XML: of Qualisys Track Manager (`.qca.txt`), and of Vicon (`.xcp`).
 
-A `KeyFrame` has the camera's centre C in millimetres (`POSITION`), the rotation from world to camera as quaternion
-(x, y, z, w) (`ORIENTATION`), with x right, y down and z forward, the focal length in pixels, and the lens:
+**Qualisys.** Lengths in the image are in units of 1/64 pixel; the distortion coefficients are OpenCV's and have no
+unit. `transform` has the camera's centre in millimetres and the matrix R_q whose rows are the camera's axes in the
+world, with x right, y up and z backwards: R = diag(1, -1, -1) R_q, t = -R C.
+
+Qualisys's manuals do not describe the file. Pose2Sim's reader (`calibration.py`, `read_qca`) has the same unit of 1/64
+pixel, field of view and axes, but divides the distortion by 64 as well. The k1 of its demonstration, -0.046, would then
+move the corners by a third of a pixel, too little to be worth stating. Other readers use the coefficients as they are,
+in OpenCV's order.
+
+**Vicon.** A `KeyFrame` has the camera's centre C in millimetres (`POSITION`), the rotation from world to camera as
+quaternion (x, y, z, w) (`ORIENTATION`), with x right, y down and z forward, the focal length in pixels, and the lens:
 
 - `VICON_RADIAL` "k1 k2": a point at distance r of the principal point, in pixels, belongs at r (1 + k1 r² + k2 r⁴);
 - `VICON_RADIAL2` "ViconRadial2 cx cy k1 k2 k3": the same about (cx, cy), with r in pixels or in focal lengths.
@@ -32,6 +41,15 @@ from psotrack.geometry.rig_files.guarded_text import attributes, number, parse_x
 
 _logger = logging.getLogger(__name__)
 
+#: Parts of a pixel in which lengths are measured.
+_PARTS = 64.0
+#: From axes x right, y up, z backwards to x right, y down, z forward.
+_TURN = np.diag([1.0, -1.0, -1.0])
+_RADIAL = ("radialDistortion1", "radialDistortion2", "radialDistortion3")
+# The misspelling is Qualisys's.
+_TANGENTIAL = ("tangentalDistortion1", "tangentalDistortion2")
+_logger = logging.getLogger(__name__)
+
 #: A smaller |k1| is per square pixel: in focal lengths it would be no distortion at all, below 0.1 px in every image.
 _PER_PIXEL = 1e-4
 #: Largest error of OpenCV's coefficients that is accepted without a word, pixels.
@@ -42,12 +60,80 @@ _GRID = 41
 _EXACT_PX = 0.01
 
 
-def recognises(text: str) -> bool:
+def is_qualisys(text: str) -> bool:
+    """Whether a text is a calibration of Qualisys."""
+    return "<calibration" in text[:4096] and "<transform" in text
+
+
+def read_qualisys(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read a .qca.txt; lengths are millimetres."""
+    for index, element in enumerate(parse_xml(path, text).iterfind(".//camera")):
+        name = element.get("serial") or element.get("name")
+        if not name:
+            raise CameraFields(path, f"camera[{index}]", {}).error("serial", "a serial number", "none")
+        place = f"camera {name}"
+        if element.get("viewrotation", "0") not in {"0", ""}:
+            _logger.warning(
+                "%s, %s: its view is turned by %s degrees; the calibration is for images that are not turned",
+                path, place, element.get("viewrotation"),
+            )  # fmt: skip
+        lens = _qualisys_lens(path, place, element)
+        values = lens | _qualisys_pose(path, place, element) if lens else {}
+        yield CameraFields(path, place, values, name, unit_m=1e-3)
+
+
+def _qualisys_lens(path: Path, place: str, element: ElementTree.Element) -> dict[str, Any]:
+    lens = element.find("intrinsic")
+    if lens is None:
+        return {}
+    fields = attributes(path, f"{place}, intrinsic", lens)
+    (left, top), size = _field_of_view(path, place, element, fields)
+    names = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
+    fu, fv, cu, cv = (number(fields, name) / _PARTS for name in names)
+    # The skew's unit is not documented, and all known files have none.
+    if "skew" in fields.values and number(fields, "skew"):
+        raise fields.error("skew", "0", f"{number(fields, 'skew'):g}")
+    k1, k2, k3, p1, p2 = (
+        number(fields, name) if name in fields.values else 0.0 for name in (*_RADIAL, *_TANGENTIAL)
+    )
+    return {
+        "size": size,
+        "K": [[fu, 0.0, cu - left], [0.0, fv, cv - top], [0.0, 0.0, 1.0]],
+        "D": [k1, k2, p1, p2, k3],
+    }
+
+
+def _field_of_view(
+    path: Path, place: str, element: ElementTree.Element, lens: CameraFields
+) -> tuple[tuple[float, float], tuple[int, int]]:
+    """First pixel of the images on the sensor, and their width and height."""
+    view = element.find("fov_video")
+    if view is None:
+        # The last part of a pixel, or the last pixel itself: in either case its number is the size less one.
+        width, height = (int(number(lens, f"sensorMax{axis}") // _PARTS) + 1 for axis in "UV")
+        return (0.0, 0.0), (width, height)
+    fields = attributes(path, f"{place}, fov_video", view)
+    left, top, right, bottom = (number(fields, side) for side in ("left", "top", "right", "bottom"))
+    return (left, top), (int(right - left) + 1, int(bottom - top) + 1)
+
+
+def _qualisys_pose(path: Path, place: str, element: ElementTree.Element) -> dict[str, Any]:
+    """Rotation and translation; none of a camera that was not calibrated."""
+    pose = element.find("transform")
+    if pose is None or element.get("calibrated", "true").lower() == "false":
+        return {}
+    fields = attributes(path, f"{place}, transform", pose)
+    turn = np.array([[number(fields, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)])
+    R = _TURN @ fields.rotation_matrix(turn, "r11 to r33")
+    return {"R": R, "t": -R @ [number(fields, axis) for axis in "xyz"]}
+
+
+def is_vicon(text: str) -> bool:
     """Whether a text is a calibration of Vicon."""
     return "<Cameras" in text[:4096] and "DEVICEID" in text
 
 
-def read(path: Path, text: str) -> Iterator[CameraFields]:
+def read_vicon(path: Path, text: str) -> Iterator[CameraFields]:
     """Read an .xcp; lengths are millimetres. If it has video cameras, cameras for markers are left out."""
     cameras = parse_xml(path, text).findall("Camera")
     videos = [one for one in cameras if _is_video(one)]
