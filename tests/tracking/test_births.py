@@ -589,7 +589,10 @@ def test_the_assignment_has_the_largest_likelihood(seed):
     sigma = 6.0 / 3
 
     def log_likelihood(one, k):
-        moved = oracle_log_density(one, place[k], velocity[k], gap[k] + 0.5, sigma)
+        own = np.clip(np.linalg.norm(velocity[k]) / np.sqrt(3), 0.3, sigma)
+        moved = max(
+            oracle_log_density(one, place[k], velocity[k], gap[k] + 0.5, each) for each in (own, sigma)
+        )
         anywhere = norm.logpdf(one.velocity_m_s, 0, sigma).sum() - np.log(ROOM_M3)
         return max(moved, anywhere) + norm.logpdf(np.log(0.5 / span[k]), 0, 0.2)
 

@@ -21,8 +21,9 @@ from psotrack.tracking.births.initial_state import room_bounds
 from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
 from psotrack.trajectories import Tracks
 
-#: Number of windows, and frames of a window: enough for a drone to be born before two cameras.
-WINDOWS, WINDOW_FRAMES = 12, 16
+#: Least number of windows; frames of a window, enough for a drone to be born before two cameras that miss it at times;
+#: share of the frames of a long recording of detections in which windows are.
+WINDOWS, WINDOW_FRAMES, WINDOWS_SHARE = 12, 30, 0.2
 #: Time between two frames of a window, seconds; at lower rates, one frame.
 STEP_S = 0.04
 #: Largest speed that is looked for, m/s.
@@ -31,11 +32,8 @@ FASTEST_M_S = 60.0
 MOST_SIGHTINGS = 12
 #: A point counts if its standard deviation is below this share of its distance from the cameras.
 MOST_VAGUE = 0.1
-#: The volume reaches beyond the points by this share of their largest extent, metres at least. Only some windows are
-#: looked at, and drones that fly far fly high too.
-MARGIN, LEAST_MARGIN_M = 0.15, 1.0
-#: The room of the cameras is extended where points are outside of it, or nearer to its border than this, metres.
-NEAR_BOUND_M = 0.5
+#: The volume reaches beyond the points by as much as drones fly between two windows, metres at least.
+LEAST_MARGIN_M = 1.0
 #: The speed limit is this many times the largest speed that is seen.
 SPEED_MARGIN = 1.5
 #: Speeds of tracks are those over the first time, their median over the second, seconds: one jump is not fast.
@@ -59,11 +57,13 @@ class MovingPoints:
         position_m: (points, 3), positions where they were first found, metres.
         speed_m_s: (points,), speeds.
         speed_std_m_s: (points,), standard deviations of the speeds.
+        apart_s: longest time from a frame to the nearest window.
     """
 
     position_m: Float[np.ndarray, "points 3"]
     speed_m_s: Float[np.ndarray, "points"]
     speed_std_m_s: Float[np.ndarray, "points"]
+    apart_s: float
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -179,11 +179,10 @@ def with_speed_of_tracks(volume: FlightVolume, tracks: Tracks, fps: float) -> Fl
 
 
 def _extended(rig: Rig, room_m: Float[np.ndarray, "2 3"], points: MovingPoints) -> Float[np.ndarray, "2 3"]:
-    """The room, extended to the moving points outside of it with a margin."""
-    low, high = np.quantile(points.position_m, [OUTLIERS, 1 - OUTLIERS], axis=0)
-    margin_m = max(LEAST_MARGIN_M, MARGIN * float((high - low).max()))
-    low_m = np.where(low < room_m[0] + NEAR_BOUND_M, np.minimum(low - margin_m, room_m[0]), room_m[0])
-    high_m = np.where(high > room_m[1] - NEAR_BOUND_M, np.maximum(high + margin_m, room_m[1]), room_m[1])
+    """The room, extended to the moving points and as far about them as drones fly between the windows."""
+    low_m, high_m = np.quantile(points.position_m, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    margin_m = max(LEAST_MARGIN_M, points.largest_speed_m_s * points.apart_s)
+    low_m, high_m = np.minimum(low_m - margin_m, room_m[0]), np.maximum(high_m + margin_m, room_m[1])
     axis_z = rig.cameras.T_cam_world[:, 2, 2].mean()
     below = points.position_m[:, 2] < room_m[0, 2]
     if axis_z < -LOOKS_DOWN and below.mean() < MOST_BELOW:
@@ -216,12 +215,14 @@ def moving_points(
         frames = np.flatnonzero(np.sum(by_viewpoint, axis=0) >= 2)
         # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
         rules = replace(rules, min_viewpoints=2)
-    step = max(1, round(STEP_S * fps))
+    step, count = max(1, round(STEP_S * fps)), WINDOWS
+    if isinstance(found, Sightings):
+        count = max(count, round(WINDOWS_SHARE * len(frames) / (step * WINDOW_FRAMES)))
     last = 0 if not len(frames) else int(frames[-1])
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
-    chosen = np.linspace(0, len(starts) - 1, min(WINDOWS, len(starts))).round().astype(int)
+    starts = starts[np.unique(np.linspace(0, len(starts) - 1, min(count, len(starts))).round().astype(int))]
     points, limits = [], FlightLimits(fps / step, wide_bounds(rig), FASTEST_M_S)
-    for first in starts[np.unique(chosen)].tolist():
+    for first in starts.tolist():
         # The last window ends at the last of the frames.
         stop = min(first + step * WINDOW_FRAMES, last + 1)
         if isinstance(found, Sightings):
@@ -233,7 +234,8 @@ def moving_points(
             births.step(number, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
         points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]
     table = np.array([point for point in points if point is not None]).reshape(-1, 5)
-    return MovingPoints(table[:, :3], table[:, 3], table[:, 4])
+    apart_s = max(int(np.diff(starts).max(initial=0)) - step * WINDOW_FRAMES, 0) / 2 / fps
+    return MovingPoints(table[:, :3], table[:, 3], table[:, 4], apart_s)
 
 
 def _point(rig: Rig, candidate: TrackCandidate, step_s: float) -> tuple[float, ...] | None:

@@ -50,8 +50,9 @@ NEW_ODDS, UNSURE_ODDS, NO_DRONE_ODDS = 0.1, 3.0, 10.0
 NEW_ODDS_OUTSIDE, LEAVES_S = 1.0, 0.5
 #: Number of drones that are taken to have come before the first one did: Jeffreys' prior of a rate.
 CAME_BEFORE = 0.5
-#: New drones come where drones were found, and this far about it, metres: a few flights do not show all of the region.
-AROUND_M = 1.0
+#: New drones come where drones were found, and as far about it as a drone flies in this time: a few flights do not show
+#: all of the region.
+AROUND_S = 0.5
 #: Two drones are at the same place if their distance, divided along each axis by this share of their mean size, is
 #: below 1.
 SAME_PLACE = 0.5
@@ -237,9 +238,9 @@ def reidentify(
         is_out = in_images(cameras, lost.position_m + LEAVES_S * lost.velocity_m_s).sum(axis=-1) < 2
     odds_of_new = np.where(is_out, NEW_ODDS_OUTSIDE, NEW_ODDS)
     places_m = np.concatenate([lost.region_m, *(one.position_m[None] for one in candidates)])
-    low_m, high_m = np.clip(_box_m(places_m) + AROUND_M * np.array([[-1.0], [1.0]]), *limits.bounds_m)
+    around_m = AROUND_S * SPEED_SHARE * limits.max_speed_m_s * np.array([[-1.0], [1.0]])
+    low_m, high_m = np.clip(_box_m(places_m) + around_m, *limits.bounds_m)
     log_volume = float(np.log(np.prod(high_m - low_m)))
-    variance = (SPEED_SHARE * limits.max_speed_m_s) ** 2
     is_ghost = [any(_departs_from(other, one) for other in candidates) for one in candidates]
     is_dying = [_is_dying_ghost(one, lost, limits.fps) for one in candidates]
     may_be_new = [
@@ -248,7 +249,7 @@ def reidentify(
     ]
     scores = np.full((len(candidates), count + len(candidates)), _IMPOSSIBLE)
     for row, candidate in enumerate(candidates):
-        log_new = log_normal(candidate.velocity_m_s, variance) - log_volume
+        log_new = _log_velocity(candidate.velocity_m_s, limits) - log_volume
         odds = NEW_ODDS if candidate.is_sure or not lost.new_per_s else UNSURE_ODDS
         log_new += _log_span_of_new(candidate, lost) + np.log(odds if candidate.moves else NO_DRONE_ODDS)
         scores[row, count + row] = _NEW_NOT_ALLOWED if candidate.moves and max_births == 0 else log_new
@@ -289,12 +290,11 @@ def _log_likelihood(
     if not np.isfinite(span):
         span = float(candidate.size_m.max())
     log_span = log_normal(np.log(candidate.size_m.max(keepdims=True) / span), SPAN_STD**2)
-    variance = (SPEED_SHARE * limits.max_speed_m_s) ** 2
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
     if _may_have_stayed(candidate, lost, row, limits):
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
-        log_stayed += log_normal(candidate.velocity_m_s, variance)
+        log_stayed += _log_velocity(candidate.velocity_m_s, limits)
     if lost.doubtful[row]:
         return log_stayed + log_span if candidate.moves and log_stayed > -np.inf else _IMPOSSIBLE
     gap_s = (candidate.instant - int(lost.instant[row])) / limits.fps
@@ -306,7 +306,9 @@ def _log_likelihood(
         return _UNREACHABLE - distance
     before = np.stack([place, velocity])
     after = np.stack([candidate.position_m, candidate.velocity_m_s])
-    log_flown = log_transition(before, after, gap_s, variance, limits.bounds_m)
+    log_flown = max(
+        log_transition(before, after, gap_s, each, limits.bounds_m) for each in _speeds2(velocity, limits)
+    )
     num_flying = sum(
         not doubtful and not _stands(lost, each, limits) for each, doubtful in enumerate(lost.doubtful)
     )
@@ -314,6 +316,18 @@ def _log_likelihood(
     log_flown -= np.log(odds / NEW_ODDS * max(num_flying, 1))
     log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, limits) else 0.0
     return max(log_stayed, log_flown) + log_span
+
+
+def _speeds2(velocity_m_s: Float[np.ndarray, "3"], limits: FlightLimits) -> tuple[float, float]:
+    """Variances of the velocity along each axis, m2/s2: a drone goes on as slowly as it flies, or as any drone."""
+    any_drone = (SPEED_SHARE * limits.max_speed_m_s) ** 2
+    own = max(float(velocity_m_s @ velocity_m_s) / 3, VELOCITY_STD_M_S**2)
+    return min(own, any_drone), any_drone
+
+
+def _log_velocity(velocity_m_s: Float[np.ndarray, "3"], limits: FlightLimits) -> float:
+    """Log density of the velocity of a drone that is known from nothing else."""
+    return max(log_normal(velocity_m_s, each) for each in _speeds2(velocity_m_s, limits))
 
 
 def _stands(lost: LostTracks, row: int, limits: FlightLimits) -> bool:
