@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
 from msgspec import Meta
@@ -16,6 +16,9 @@ from psotrack.cli.types import SequencePath, Words, says
 
 if TYPE_CHECKING:
     from psotrack.recordings.datasets import DraftOptions, Matching
+
+#: Width of the table in a file or a pipe, characters.
+_WIDE = 200
 
 
 def _pair(match: str) -> tuple[str, str]:
@@ -73,7 +76,7 @@ def init(
         out: file to write. None: FOLDER/recording.toml.
         show: show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.
     """
-    from psotrack.recordings import RECORDING_FILE, inventory_table
+    from psotrack.recordings import RECORDING_FILE
     from psotrack.recordings.datasets import DraftOptions, draft_recording
 
     if show:
@@ -89,9 +92,7 @@ def init(
     for each in draft.recording.cameras:
         each.check_size()
     older = draft.write()
-    content = draft.to_dict()
-    output.json(content)
-    output.show(inventory_table(content), wide=True)
+    _say_inventory(output, draft.to_dict())
     output.say(*str(draft).splitlines())
     if older is not None:
         output.say(f"{older}: the file as it was; copy what you had written into it")
@@ -99,7 +100,6 @@ def init(
 
 def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
     """Show a recording, and check its files."""
-    from psotrack.recordings import inventory_table
     from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(sequence, bodies=bodies)
@@ -110,9 +110,15 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
         from psotrack.inside_out import read_marker_table
 
         read_marker_table(recording.marker_corners)
-    content = recording.to_dict()
+    _say_inventory(output, recording.to_dict())
+
+
+def _say_inventory(output: Output, content: dict[str, Any]) -> None:
+    from psotrack.recordings import inventory
+
     output.json(content)
-    output.show(inventory_table(content), wide=True)
+    title, headings, rows = inventory(content)
+    output.table(headings, rows, title, least_width=_WIDE)
 
 
 def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:

@@ -124,8 +124,6 @@ class _Formatter(logging.Formatter):
         return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
 
 
-#: Width of a wide table in a file or a pipe, characters.
-_WIDE = 200
 #: Values of --progress.
 PROGRESS: dict[str, Report] = {
     "auto": progress_bar,
@@ -228,27 +226,17 @@ class Output:
             if self.shows or (always and not self._json_on_stdout):
                 click.echo(sentence)
 
-    def show(self, *shown: object, wide: bool = False) -> None:
-        """Print tables and other things of rich; a wide one in its full width where stdout is no terminal."""
-        from rich.console import Console
-
-        if self.shows:
-            console = Console()
-            if wide and not console.is_terminal:
-                console = Console(width=max(console.width, _WIDE))
-            for each in shown:
-                console.print(each)
-
     def table(
         self,
         headings: tuple[str, ...],
         rows: Iterable[tuple[str, ...]],
         title: str = "",
         whole: tuple[str, ...] = (POSITION,),
+        least_width: int = 0,
     ) -> None:
         """Print a table, names in the first column and numbers in the others; see `text_table`."""
         if self.shows:
-            click.echo(text_table(headings, rows, title, whole))
+            click.echo(text_table(headings, rows, title, whole, least_width))
 
     def result(self, result: _Shown) -> None:
         """Write a result as --json says, and print it."""

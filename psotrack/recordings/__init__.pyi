@@ -12,7 +12,7 @@ from .image_files import (
     read_mask,
 )
 from .image_views import ImageViews, ellipse_outlines_px, view_in_images
-from .inventory import inventory_table
+from .inventory import inventory
 from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
 from .recording import OnboardVideo, Recording, Reference, Timing, recording_of_video, with_all_videos
@@ -87,7 +87,7 @@ __all__ = [
     "frame_times",
     "image_files",
     "image_of",
-    "inventory_table",
+    "inventory",
     "is_image",
     "is_picture_folder",
     "join_videos",

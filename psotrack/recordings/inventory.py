@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from psotrack.support import html_block, html_table
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 _HEADINGS = ("camera", "video", "frames", "fps", "size", "f (px)", "centre (m)", "detections")
 
 
-def inventory_table(content: dict[str, Any]) -> Table:
-    """Table with one row per camera; cameras on drones come last.
+def inventory(content: dict[str, Any]) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
+    """Title, headings and rows of the table: one row per camera; cameras on drones come last.
 
     Args:
         content: plain data from `Recording.to_dict`.
     """
-    from rich import box
-    from rich.table import Table
-
-    table = Table(title=_heading(content), title_justify="left", box=box.HORIZONTALS, show_edge=False)
-    for name in _HEADINGS:
-        left = name in ("camera", "video")
-        table.add_column(name, justify="left" if left else "right", overflow="fold" if left else "ellipsis")
-    for row in _rows(content):
-        table.add_row(*row)
-    return table
+    return _heading(content), _HEADINGS, list(_rows(content))
 
 
 def inventory_html(content: dict[str, Any]) -> str:
     """The same table as HTML for notebooks."""
-    return html_block(_heading(content), html_table(_HEADINGS, _rows(content)))
+    title, headings, rows = inventory(content)
+    return html_block(title, html_table(headings, rows))
 
 
 def _heading(content: dict[str, Any]) -> str:

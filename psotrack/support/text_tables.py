@@ -15,6 +15,7 @@ def text_table(
     rows: Iterable[Sequence[str]],
     title: str = "",
     whole: Collection[str] = (POSITION,),
+    least_width: int = 0,
 ) -> str:
     """A table with names in the first column and numbers in the others, as wide as the terminal or narrower.
 
@@ -23,6 +24,7 @@ def text_table(
         rows: texts of the cells.
         title: a line above the table.
         whole: headings of the columns whose cells are not broken into lines.
+        least_width: room that there is at least where the text goes to no terminal, characters.
     """
     from rich import box
     from rich.console import Console
@@ -30,13 +32,15 @@ def text_table(
     from rich.text import Text
 
     tight: Any = {"show_edge": False, "pad_edge": False, "padding": (0, 0, 0, 1)}
-    table = Table(box=box.HORIZONTALS, title=title or None, **tight)
+    table = Table(box=box.HORIZONTALS, title=title or None, title_justify="left", **tight)
     for index, heading in enumerate(headings):
         style: Any = {"justify": "right"} if index else {"min_width": 5}
         table.add_column(heading, no_wrap=index > 0 and heading in whole, overflow="fold", **style)
     for row in rows:
         table.add_row(*map(Text, row))
     console = Console(color_system=None)
+    if not console.is_terminal:
+        console.width = max(console.width, least_width)
     with console.capture() as capture:
         console.print(table)
     return "\n".join(line.rstrip() for line in capture.get().splitlines())

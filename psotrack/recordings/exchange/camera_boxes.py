@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.recordings import Recording, view_in_images
+from psotrack.recordings import FrameTimes, Recording, view_in_images
 from psotrack.support import short_repr
 from psotrack.trajectories import Trajectories, resample
 
@@ -33,43 +33,19 @@ class Footage:
     __repr__ = short_repr
 
 
-@dataclass(frozen=True, repr=False)
-class CameraFrames:
-    """The frames of one camera during the tracks.
-
-    Attributes:
-        name: name of the camera.
-        index: place of the camera in the rig.
-        time_s: (frames,), times of the camera's frames from frame 0 on, seconds.
-        fps: frames per second.
-        image_size_wh: width and height, pixels.
-    """
-
-    name: str
-    index: int
-    time_s: Float[np.ndarray, "frames"]
-    fps: float
-    image_size_wh: tuple[int, int]
-
-    __repr__ = short_repr
-
-
-def camera_frames(recording: Recording, trajectories: Trajectories) -> list[CameraFrames]:
-    """The cameras with frames before the end of the tracks, and these frames."""
-    found = []
-    for index, name in enumerate(recording.rig.names):
-        times = recording.exposed[name]
+def camera_frames(recording: Recording, trajectories: Trajectories) -> dict[str, FrameTimes]:
+    """The times of the frames before the end of the tracks, of each camera that has some, by its name."""
+    found = {}
+    for name, times in recording.exposed.items():
         last_s = trajectories.time_s[-1] + 0.5 / times.fps
-        time_s = times.time_s[times.time_s <= last_s]
-        if len(time_s):
-            width, height = recording.rig.cameras.image_size_wh[index].astype(int).tolist()
-            found.append(CameraFrames(name, index, time_s, float(times.fps), (width, height)))
-    return found
+        found[name] = times.cut(int(np.count_nonzero(times.time_s <= last_s)))
+    return {name: times for name, times in found.items() if times.num_frames}
 
 
 def boxes_in_camera(
     recording: Recording,
-    camera: CameraFrames,
+    name: str,
+    times: FrameTimes,
     trajectories: Trajectories,
     size_m: Float[np.ndarray, "drones 3"],
 ) -> Float[np.ndarray, "frames drones 4"]:
@@ -79,13 +55,14 @@ def boxes_in_camera(
 
     Args:
         recording: the recording, with the rig.
-        camera: the camera's frames.
+        name: name of the camera.
+        times: times of the camera's frames.
         trajectories: the tracks.
         size_m: (drones, 3), full lengths of the drones along the world's axes, metres.
     """
     gap_s = _GAP * float(np.median(np.diff(trajectories.time_s))) if trajectories.num_frames > 1 else 0.0
     position_m = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
     seen = Trajectories(trajectories.frame, trajectories.time_s, trajectories.drones, position_m)
-    at_frames = resample(seen, np.arange(len(camera.time_s)), camera.time_s, gap_s=gap_s)
-    alone = replace(recording, cameras=(recording.by_name[camera.name],))
+    at_frames = resample(seen, np.arange(times.num_frames), times.time_s, gap_s=gap_s)
+    alone = replace(recording, cameras=(recording.by_name[name],))
     return view_in_images(alone, at_frames, size_m).boxes_px[:, :, 0]

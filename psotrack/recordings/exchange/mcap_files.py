@@ -33,9 +33,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError, install_command
-from psotrack.geometry import Camera, Rig
-from psotrack.recordings import Recording, read_frames
-from psotrack.recordings.exchange.camera_boxes import CameraFrames, Footage, camera_frames
+from psotrack.geometry import Camera
+from psotrack.recordings import FrameTimes, Recording, VideoInfo, read_frames
+from psotrack.recordings.exchange.camera_boxes import Footage, camera_frames
 from psotrack.recordings.exchange.timed_paths import joined, timed_path
 from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat
 from psotrack.trajectories import Trajectories
@@ -207,19 +207,27 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
             found=f"{trajectories.time_s.min():g} s",
         )
     names = _ros_names(trajectories.drones, "drone")
-    frames = [] if footage is None else camera_frames(footage.recording, trajectories)
-    camera_names = _ros_names([camera.name for camera in frames], "cam")
+    frames = {} if footage is None else camera_frames(footage.recording, trajectories)
+    camera_names = _ros_names(list(frames), "cam")
     _check_different([WORLD, *names, *camera_names])
-    cameras = dict(zip(camera_names, frames, strict=True))
-    filmed = {}
-    if footage is not None and footage.images:
-        filmed = {name: each for name, each in cameras.items() if each.name in footage.recording.videos}
-    total = trajectories.num_frames + sum(len(camera.time_s) for camera in filmed.values())
+    lenses, filmed = dict[str, Camera](), dict[str, str]()
+    if footage is not None:
+        rig = footage.recording.rig
+        lenses = {
+            name: rig.cameras[rig.names.index(own)] for name, own in zip(camera_names, frames, strict=True)
+        }
+        shown = footage.recording.videos if footage.images else {}
+        filmed = {name: own for name, own in zip(camera_names, frames, strict=True) if own in shown}
+    total = trajectories.num_frames + sum(frames[own].num_frames for own in filmed.values())
     with report("messages", total) as advance, path.open("wb") as stream:
         streams = [_drone_messages(trajectories, names, advance)]
         if footage is not None:
-            places = _camera_messages(footage.recording.rig, cameras, float(trajectories.time_s[-1]))
-            images = [_image_messages(footage, each, name, advance) for name, each in filmed.items()]
+            places = _camera_messages(lenses, float(trajectories.time_s[-1]))
+            videos = footage.recording.videos
+            images = [
+                _image_messages(name, lenses[name], videos[own], frames[own], advance)
+                for name, own in filmed.items()
+            ]
             streams = [places, *streams, *images]
         writer = writer_class(stream)
         schemas = {name: writer.register_msgdef(name, text) for name, text in DEFINITIONS.items()}
@@ -228,11 +236,10 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
         for time_ns, topic, kind, content in heapq.merge(*streams, key=lambda message: message[0]):
             writer.write_message(topic, schemas[kind], content, time_ns, time_ns)
         writer.finish()
-    if footage is None:
-        return []
-    lenses = [(camera.name, footage.recording.rig.cameras[camera.index]) for camera in frames]
-    lost = [name for name, lens in lenses if camera_message({}, lens) is None]
-    return [f"the lens of {name}, for which ROS has no model" for name in lost]
+    lost = [
+        own for own, lens in zip(frames, lenses.values(), strict=True) if camera_message({}, lens) is None
+    ]
+    return [f"the lens of {own}, for which ROS has no model" for own in lost]
 
 
 def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
@@ -375,9 +382,8 @@ def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advan
             yield time_ns, "/tf", TRANSFORMS, {"transforms": transforms}
 
 
-def _camera_messages(rig: Rig, cameras: dict[str, CameraFrames], last_s: float) -> Iterator[_Message]:
+def _camera_messages(lenses: dict[str, Camera], last_s: float) -> Iterator[_Message]:
     """Lenses of the cameras at time 0, and their places at each whole second and at the end."""
-    lenses = {name: rig.cameras[each.index] for name, each in cameras.items()}
     for name, lens in lenses.items():
         info = camera_message(header(0, name), lens)
         if info is not None:
@@ -390,12 +396,10 @@ def _camera_messages(rig: Rig, cameras: dict[str, CameraFrames], last_s: float) 
 
 
 def _image_messages(
-    footage: Footage, camera: CameraFrames, name: str, advance: Advance
+    name: str, lens: Camera, video: VideoInfo, times: FrameTimes, advance: Advance
 ) -> Iterator[_Message]:
     """The images of a camera, each with the camera's lens; an image whose time is below 0 is left out."""
-    video = footage.recording.videos[camera.name]
-    times_ns = np.round(camera.time_s * 1e9).astype(np.int64).tolist()
-    one = footage.recording.rig.cameras[camera.index]
+    times_ns = np.round(times.time_s * 1e9).astype(np.int64).tolist()
     wanted = replace(video, num_frames=min(video.num_frames, len(times_ns)))
     for time_ns, image in zip(times_ns, read_frames(wanted), strict=False):
         advance(1)
@@ -403,7 +407,7 @@ def _image_messages(
             continue
         encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
         head = header(time_ns, name)
-        info = camera_message(head, one)
+        info = camera_message(head, lens)
         if info is not None and time_ns > 0:
             yield time_ns, f"/{name}/camera_info", CAMERA_INFO, info
         content = {"header": head, "format": "jpeg", "data": encoded}

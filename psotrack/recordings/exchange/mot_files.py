@@ -83,17 +83,17 @@ def _write_folder(folder: Path, trajectories: Trajectories, footage: Footage, re
     split = f"{BENCHMARK}-{SPLIT}"
     names = []
     with report("boxes", len(cameras)) as advance:
-        for camera in cameras:
-            name = check_file_name(f"{recording.name}-{camera.name}", recording.folder)
+        for camera, times in cameras.items():
+            name = check_file_name(f"{recording.name}-{camera}", recording.folder)
             names.append(name)
             sequence = folder / "gt" / split / name
-            _write_info(sequence, name, camera.fps, len(camera.time_s), camera.image_size_wh)
-            boxes = boxes_in_camera(recording, camera, trajectories, size_m)
+            size_wh = recording.rig.cameras.image_size_wh[recording.rig.names.index(camera)].astype(int)
+            _write_info(sequence, name, times.fps, times.num_frames, size_wh.tolist())
+            boxes = boxes_in_camera(recording, camera, times, trajectories, size_m)
             _write_boxes(folder / "trackers" / split / TRACKER / "data" / f"{name}.txt", boxes, ",-1,-1,-1")
             if truth is not None:
-                boxes = boxes_in_camera(
-                    recording, camera, truth, _reference_sizes(trajectories, truth, size_m)
-                )
+                truth_m = _reference_sizes(trajectories, truth, size_m)
+                boxes = boxes_in_camera(recording, camera, times, truth, truth_m)
                 _write_boxes(sequence / "gt" / "gt.txt", boxes, ",1,1")
             advance(1)
     maps = folder / "gt" / "seqmaps" / f"{split}.txt"
@@ -194,7 +194,7 @@ def _write_boxes(path: Path, xyxy: Float[np.ndarray, "frames drones 4"], end: st
     path.write_text("".join(lines), encoding="ascii")
 
 
-def _write_info(folder: Path, name: str, fps: float, frames: int, size_wh: tuple[int, int] | None) -> None:
+def _write_info(folder: Path, name: str, fps: float, frames: int, size_wh: list[int] | None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     values = {"name": name, "imDir": "img1", "frameRate": repr(float(fps)), "seqLength": frames}
     if size_wh is not None:
