@@ -108,6 +108,18 @@ def errors_name(path: object) -> Iterator[None]:
         raise error.within(path) from error
 
 
+@contextlib.contextmanager
+def system_errors(
+    where: object, expected: str, kind: type[PsotrackError] = InputError, remedy: str = ""
+) -> Iterator[None]:
+    """Errors of the operating system in the block become errors about a file, folder or address."""
+    try:
+        yield
+    except OSError as error:
+        found = f"{error.strerror or error}".lower()
+        raise kind(where, expected=expected, found=found, remedy=remedy) from error
+
+
 def check_positive(name: str, value: float, remedy: str = "") -> None:
     """Raise `SettingsError` unless `value` is a finite number above 0.
 

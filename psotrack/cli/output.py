@@ -17,7 +17,7 @@ import click
 
 from psotrack import __version__
 from psotrack.cli.types import says
-from psotrack.errors import OutputError, PsotrackError, SettingsError
+from psotrack.errors import OutputError, PsotrackError, SettingsError, system_errors
 from psotrack.support import (
     POSITION,
     Report,
@@ -80,16 +80,13 @@ def logged(path: Path) -> Iterator[None]:
 def _opened(path: Path) -> _Handler:
     if path == Path("-"):
         raise OutputError(path, expected="the path of a log file", found="-; stderr is /dev/stderr")
-    try:
+    with system_errors(path, "a log file that can be written", OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_file() and not _begins_like_a_log(path):
             # A user who names a file of tracks by mistake must not get lines of a log in it.
             expected, found = "a new file, or a log of psotrack", "another file, which is unchanged"
             raise OutputError(path, expected=expected, found=found)
         handler = _Handler(path, encoding="utf-8")
-    except OSError as error:
-        found = error.strerror or f"{error}"
-        raise OutputError(path, expected="a log file that can be written", found=found) from error
     handler.setLevel(logging.INFO)
     handler.setFormatter(_Formatter())
     return handler

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import InputError, OutputError, SettingsError, system_errors
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import (
     RECORDING_FILE,
@@ -188,7 +188,7 @@ def recording_folder(
             expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
             raise SettingsError("--record", expected=expected, found=f"{width} x {height} of camera {name}")
     tables = {name: _table(recording.by_name[name]) for name in names}
-    try:
+    with system_errors(folder, "a folder that can be written", OutputError):
         folder.mkdir(parents=True, exist_ok=True)
         # Otherwise the files of an earlier recording would be taken for those of a camera that stays silent.
         _remove_files(folder, tables)
@@ -196,9 +196,6 @@ def recording_folder(
             ignore = recording.by_name[name].ignore
             if ignore is not None:
                 shutil.copyfile(ignore, folder / f"{table.ignore}")
-    except OSError as error:
-        expected, found = "a folder that can be written", error.strerror or f"{error}"
-        raise OutputError(folder, expected=expected, found=found) from error
     write_rig(folder / _RIG_FILE, rig, force=True)
     _write_tables(folder, tables, recording)
     try:

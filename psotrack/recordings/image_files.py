@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 from PIL import Image
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, system_errors
 from psotrack.recordings.opencv_messages import decode_jpeg, silence_opencv
 
 #: Endings of files that are read as images.
@@ -47,19 +47,11 @@ def image_files(folder: Path) -> list[Path]:
     Raises:
         InputError: the folder cannot be read.
     """
-    try:
-        return sorted(
-            (
-                path
-                for path in folder.iterdir()
-                # A name that begins with a point is a hidden file, such as macOS's ._frame1.png.
-                if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
-            ),
-            key=natural_key,
-        )
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(folder, expected="a folder to read", found=found) from error
+    with system_errors(folder, "a folder to read"):
+        # A name that begins with a point is a hidden file, such as macOS's ._frame1.png.
+        shown = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        images = [path for path in shown if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    return sorted(images, key=natural_key)
 
 
 def read_image(path: Path, depth_bits: int = 16) -> UInt8[np.ndarray, "height width 3"]:
@@ -121,10 +113,8 @@ def is_image(path: Path) -> bool:
 
 
 def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
-    try:
+    with system_errors(path, "an image"):
         coded = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(path, expected="an image", found=(error.strerror or str(error)).lower()) from error
     return image_of(coded, flags, path)
 
 

@@ -25,7 +25,7 @@ from typing import Any, Literal
 import msgspec
 import platformdirs
 
-from psotrack.errors import InputError, OutputError
+from psotrack.errors import InputError, OutputError, system_errors
 
 #: Longest name that becomes the name of a file, bytes.
 _LONGEST_NAME = 180
@@ -291,14 +291,11 @@ def read_text(path: Path | str) -> str:
     """
     check_kind(path, "a text that psotrack reads")
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(path, expected="a file to read", found=found) from error
+        with system_errors(path, "a file to read"):
+            text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            path, expected="UTF-8 text", found=f"an invalid byte at offset {error.start}"
-        ) from error
+        found = f"an invalid byte at offset {error.start}"
+        raise InputError(path, expected="UTF-8 text", found=found) from error
     check_no_nul(path, text)
     return text
 
@@ -359,11 +356,8 @@ def digest_file(
         InputError: the file cannot be read.
     """
     new = (lambda: hashlib.blake2b(digest_size=20)) if algorithm == "blake2b-160" else algorithm
-    try:
-        with Path(path).open("rb") as file:
-            return hashlib.file_digest(file, new).hexdigest()
-    except OSError as error:
-        raise InputError(path, expected=expected, found=error.strerror or f"{error}") from error
+    with system_errors(path, expected), Path(path).open("rb") as file:
+        return hashlib.file_digest(file, new).hexdigest()
 
 
 def digest_record(record: Any) -> str:

@@ -390,7 +390,7 @@ def _without_file(recording: Recording) -> Recording:
 BAD = {
     "small mask": (_with_small_mask, "small.png: expected 162 x 118 "),
     "no video": (_without_video, "expected a video for each of the cameras "),
-    "no file": (_without_file, "cam2.avi: expected a readable video, found No such file"),
+    "no file": (_without_file, "cam2.avi: expected a readable video, found no such file"),
 }
 
 

@@ -377,7 +377,7 @@ def test_the_folder_of_a_recording_keeps_other_files(laboratory: Recording, tmp_
 BAD_FOLDERS = {
     "laboratory": "--record: expected another folder",
     "odd": "even numbers of pixels",
-    "file": "expected a folder that can be written, found File exists",
+    "file": "expected a folder that can be written, found file exists",
 }
 
 

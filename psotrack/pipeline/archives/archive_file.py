@@ -22,7 +22,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from psotrack.errors import InputError, OutputError, PsotrackError
+from psotrack.errors import InputError, OutputError, PsotrackError, system_errors
 from psotrack.settings import TrackSettings
 from psotrack.support import Report, atomic_write, no_progress, read_json, refuse_to_overwrite
 
@@ -253,10 +253,8 @@ def unpack(
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """The zip file of an archive, after its names and sizes were checked."""
     try:
-        zipped = zipfile.ZipFile(path)
-    except OSError as error:
-        found = (error.strerror or f"{error}").lower()
-        raise InputError(path, expected="an archive of psotrack", found=found) from error
+        with system_errors(path, "an archive of psotrack"):
+            zipped = zipfile.ZipFile(path)
     except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
         raise _damaged(path, error) from error
     try:

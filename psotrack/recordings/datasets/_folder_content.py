@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from psotrack.errors import InputError
+from psotrack.errors import system_errors
 from psotrack.recordings import IMAGE_SUFFIXES, image_files, natural_key
 from psotrack.recordings.datasets._onboard import is_onboard_video
 from psotrack.recordings.datasets.dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS
@@ -63,11 +63,8 @@ def look_into(folder: Path) -> list[Found]:
     Raises:
         InputError: the folder cannot be read.
     """
-    try:
+    with system_errors(folder, "a folder with a recording's files"):
         paths = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(folder, expected="a folder with a recording's files", found=found) from error
     return [found for path in paths for found in _look_at(path)]
 
 
@@ -131,11 +128,11 @@ def _kind_of_text(path: Path) -> Kind:
 
 def _first_line(path: Path, fits: Callable[[str], object] = str.strip) -> str:
     """The first line that is no comment and fits; empty if there is none."""
-    try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            return next((line.strip() for line in file if not line.startswith("#") and fits(line)), "")
-    except OSError as error:
-        raise InputError(path, expected="a readable file", found=f"{error.strerror}".lower()) from error
+    with (
+        system_errors(path, "a readable file"),
+        path.open(encoding="utf-8-sig", errors="replace") as file,
+    ):
+        return next((line.strip() for line in file if not line.startswith("#") and fits(line)), "")
 
 
 def _cells(line: str) -> list[str]:

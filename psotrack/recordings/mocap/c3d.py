@@ -16,7 +16,7 @@ import ezc3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import InputError, OutputError, SettingsError, system_errors
 from psotrack.recordings.mocap.c3d_format import BLOCK_BYTES, Header, Parameters, Processor, read_layout
 from psotrack.recordings.timing import check_rate
 from psotrack.support import atomic_write, check_kind, short_repr
@@ -83,13 +83,8 @@ def read_c3d(path: Path | str) -> Markers:
     """
     path = Path(path)
     check_kind(path, "a C3D file")
-    try:
+    with system_errors(path, "a C3D file"):
         content = path.read_bytes()
-    except OSError as error:
-        found = (
-            "no such file" if isinstance(error, FileNotFoundError) else (error.strerror or str(error)).lower()
-        )
-        raise InputError(path, expected="a C3D file", found=found) from error
     try:
         processor, header, parameters = read_layout(content)
     except ValueError as error:
