@@ -23,10 +23,22 @@ from psotrack.errors import PsotrackError, SettingsError, one_short_line
 __all__ = ["cli", "main"]
 
 _COMMANDS = {
-    "Start": ["demo", "run", "board", "init", "calibrate", "doctor", "track", "live"],
-    "Results": ["evaluate", "view", "report", "overlay", "export", "archive"],
-    "Research": ["simulate", "sweep", "detect", "cache"],
-    "On-board": ["onboard"],
+    "Start": {
+        **{name: f"start.{name}" for name in ("demo", "run", "board")},
+        **{name: f"{name}.{name}" for name in ("init", "calibrate", "doctor", "track", "live")},
+    },
+    "Results": {
+        "evaluate": "results.evaluate",
+        **{name: f"showing.{name}" for name in ("view", "report", "overlay")},
+        **{name: f"results.{name}" for name in ("export", "archive")},
+    },
+    "Research": {
+        "simulate": "simulate.simulate",
+        "sweep": "research.sweep",
+        "detect": "detect.detect",
+        "cache": "research.cache",
+    },
+    "On-board": {"onboard": "onboard.onboard"},
 }
 #: Loggers of Python's warnings and of libraries.
 _FOR_DEVELOPERS = ("py.warnings", "trimesh")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,9 +21,8 @@ class LazyGroup(click.Group):
     """OptionGroup whose `--help` and completion of names import no command.
 
     Args:
-        package: package of the commands' modules; a command is the function that has the name of its module.
-        below: names of the commands, below the headings of the group's help.
-        modules: names of modules that do not have the name of their command.
+        package: package of the commands' modules.
+        below: the commands, below the headings of the group's help: module and function of each by its name.
         default: command that is meant where the first argument names no command; "" for none.
         attributes: all other arguments of `click.Group`.
     """
@@ -32,15 +31,14 @@ class LazyGroup(click.Group):
         self,
         *,
         package: str,
-        below: Mapping[str, Sequence[str]],
-        modules: Mapping[str, str] | None = None,
+        below: Mapping[str, Mapping[str, str]],
         default: str = "",
         **attributes: Any,
     ) -> None:
         super().__init__(context_settings=SETTINGS, **attributes)
         self.below, self.default = below, default
-        names = [name for names in below.values() for name in names]
-        self.places = {name: f"{package}.{(modules or {}).get(name, name)}" for name in names}
+        places = [each for places in below.values() for each in places.items()]
+        self.places = {name: f"{package}.{place}" for name, place in places}
         self.commands = _Importer(self.places)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -55,10 +53,9 @@ class LazyGroup(click.Group):
 
     def summary(self, name: str) -> str:
         """First sentence of a command's help, from the text of its module."""
-        place = self.places[name]
-        file = Path(__file__).parents[2].joinpath(*place.split("."))
+        module, _, function = self.places[name].rpartition(".")
+        file = Path(__file__).parents[2].joinpath(*module.split("."))
         text = (file / "__init__.py" if file.is_dir() else file.with_suffix(".py")).read_text("utf-8")
-        function = place.rpartition(".")[2]
         found = re.search(rf'\ndef {function}\(.*?"""(.*?\.)\s', text, re.DOTALL)
         return " ".join(found[1].split()) if found else ""
 
@@ -81,8 +78,8 @@ class _Importer(dict[str, Any]):
     """Commands by name, from the places of their modules; a module is imported when its command is looked up."""
 
     def __getitem__(self, name: str) -> click.Command:
-        place = super().__getitem__(name)
-        return getattr(import_module(place), place.rpartition(".")[2])
+        module, _, function = super().__getitem__(name).rpartition(".")
+        return getattr(import_module(module), function)
 
     def get(self, name: str, default: Any = None) -> Any:
         """As of a dict."""

@@ -357,8 +357,8 @@ def files_in(folder):
 @pytest.mark.parametrize("name", GO_ON)
 def test_the_next_run_goes_on(run_psotrack, place, world, name, monkeypatch):
     """The disk grows from call to call, and is never emptied."""
-    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
-    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
+    monkeypatch.setattr("psotrack.cli.start.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.start.SCALE", 0.25)
     words = words_of(GO_ON[name], world)
     assert run_psotrack(*words).code == 0
     whole = files_in(place)

@@ -191,8 +191,8 @@ def test_the_demonstration_ends_with_a_command_that_is_understood(
     run_psotrack: Callable[..., Output], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
-    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
+    monkeypatch.setattr("psotrack.cli.start.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.start.SCALE", 0.25)
     # For six frames, compiling the swarm would take longer than everything else.
     monkeypatch.setattr("psotrack.settings.TrackSettings", partial(TrackSettings, method="projection-lines"))
     code, out, _ = run_psotrack("demo", "--out", "demo", "--jobs", "1")

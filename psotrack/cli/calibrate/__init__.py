@@ -4,8 +4,10 @@ import click
 
 from psotrack.cli.lazy import LazyGroup
 
+_COMMANDS = {"Commands": {"convert": "commands.convert", "rig": "commands.rig"}}
 
-@click.group(cls=LazyGroup, package=__name__, below={"Commands": ["convert", "rig"]})
+
+@click.group(cls=LazyGroup, package=__name__, below=_COMMANDS)
 def calibrate() -> None:
     """Calibrate cameras, and convert calibration files.
 

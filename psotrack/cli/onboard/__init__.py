@@ -4,11 +4,17 @@ import click
 
 from psotrack.cli.lazy import LazyGroup
 
-_COMMANDS = {"Commands": ["detect", "map", "localise", "fuse"]}
-_MODULES = {"detect": "detect_markers", "map": "map_markers"}
+_COMMANDS = {
+    "Commands": {
+        "detect": "markers.detect_markers",
+        "map": "markers.map_markers",
+        "localise": "localise.localise",
+        "fuse": "fuse.fuse",
+    }
+}
 
 
-@click.group(cls=LazyGroup, package=__name__, below=_COMMANDS, modules=_MODULES)
+@click.group(cls=LazyGroup, package=__name__, below=_COMMANDS)
 def onboard() -> None:
     """Localise drones by their own cameras, from ArUco markers of known place.
 

@@ -4,7 +4,7 @@ import click
 
 from psotrack.cli.lazy import LazyGroup
 
-_COMMANDS = {"Commands": ["sequence", "fly", "labels"]}
+_COMMANDS = {"Commands": {name: f"commands.{name}" for name in ("sequence", "fly", "labels")}}
 
 
 @click.group(cls=LazyGroup, package=__name__, below=_COMMANDS, default="sequence")
