@@ -25,7 +25,11 @@ __all__ = ["cli", "main"]
 _COMMANDS = {
     "Start": {
         **{name: f"start.{name}" for name in ("demo", "run", "board")},
-        **{name: f"{name}.{name}" for name in ("init", "calibrate", "doctor", "track", "live")},
+        "init": "init.init",
+        "calibrate": "calibrate.calibrate",
+        "doctor": "calibrate.commands.doctor",
+        "track": "track.track",
+        "live": "live.live",
     },
     "Results": {
         "evaluate": "results.evaluate",

@@ -1,6 +1,5 @@
 from .causal import causal_settings, causal_tracker, track_causally
-from .inputs import check_detections, detection_files_of, prepare, usable_for
-from .parts import Method, MethodInputs, Parts
+from .inputs import Method, MethodInputs, Parts, check_detections, detection_files_of, prepare, usable_for
 from .results import (
     TrackedRecording,
     changed_settings,

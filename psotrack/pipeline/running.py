@@ -39,13 +39,15 @@ from psotrack.pipeline.corrections import (
     with_clocks,
     without_knocked,
 )
-from psotrack.pipeline.inputs import Run, prepare, usable_for
-from psotrack.pipeline.parts import (
+from psotrack.pipeline.inputs import (
     MethodInputs,
     Parts,
+    Run,
     check_detector_is_used,
     check_parts,
     find_method,
+    prepare,
+    usable_for,
 )
 from psotrack.pipeline.results import (
     MethodResult,

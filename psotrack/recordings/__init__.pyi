@@ -1,4 +1,4 @@
-from .camera_recording import CameraRecording
+from .camera_recording import ARRAY_FILE, MADE_OF, CameraRecording, StoredSilhouettes, probe_silhouettes
 from .detections import Detections, read_detections, write_detections
 from .image_files import (
     IMAGE_SUFFIXES,
@@ -10,10 +10,10 @@ from .image_files import (
     read_grey,
     read_image,
     read_mask,
+    silence_opencv,
 )
 from .image_views import ImageViews, ellipse_outlines_px, view_in_images
 from .inventory import inventory
-from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
 from .recording import OnboardVideo, Recording, Reference, Timing, recording_of_video, with_all_videos
 from .recording_file import (
@@ -28,7 +28,6 @@ from .recording_file import (
     recording_file_text,
     write_recording_file,
 )
-from .stored_silhouettes import ARRAY_FILE, MADE_OF, StoredSilhouettes, probe_silhouettes
 from .timing import (
     MOST_INSTANTS,
     REACH,

@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.recordings.image_files import check_pixels, depth_of, read_image
-from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.image_files import check_pixels, depth_of, read_image, silence_opencv
 from psotrack.recordings.timing import MOST_INSTANTS, FrameTimes
 from psotrack.support import check_kind, digest_file, digest_record
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
-from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.image_files import silence_opencv
 from psotrack.recordings.video import TruncatedVideoError, VideoInfo, open_capture, packet_times, probe
 from psotrack.support import atomic_write
 

@@ -31,7 +31,6 @@ from .files import (
     refuse_to_overwrite,
     user_cache,
 )
-from .html import html_block, html_lines, html_table
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,
@@ -54,7 +53,6 @@ from .progress import (
     report_of,
     terminal_bar,
 )
-from .representation import short_repr, short_text
 from .schema import (
     assign,
     bind,
@@ -73,7 +71,17 @@ from .schema import (
 )
 from .similarity import similarity
 from .standard_errors import block_jackknife, standard_error, time_blocks, widening
-from .text_tables import POSITION, finite_or_none, format_numbers, text_table
+from .text_tables import (
+    POSITION,
+    finite_or_none,
+    format_numbers,
+    html_block,
+    html_lines,
+    html_table,
+    short_repr,
+    short_text,
+    text_table,
+)
 
 __all__ = [
     "ARCHIVE_SUFFIX",

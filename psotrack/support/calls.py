@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import AbstractArray, Shaped
 
 from psotrack.errors import SettingsError
-from psotrack.support.representation import short_text
 from psotrack.support.schema import bind
+from psotrack.support.text_tables import short_text
 
 _Called = TypeVar("_Called", bound=Callable[..., Any])
 

@@ -1,10 +1,76 @@
-"""Tables and numbers as text, as results show themselves in terminals."""
+"""How results show themselves: text in terminals, a short `repr`, and HTML in notebooks, whose text is escaped."""
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
+
+#: Longest text of one field; longer texts are cut.
+_MOST_CHARACTERS = 60
+
+
+def short_repr(record: Any) -> str:
+    """Name of a dataclass and one short text per field, on one line per field.
+
+    >>> import numpy as np
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, repr=False)
+    ... class Pair:
+    ...     name: str
+    ...     values: np.ndarray
+    ...     __repr__ = short_repr
+    >>> Pair("left", np.zeros((3, 2)))
+    Pair(
+      name='left',
+      values=float64 (3, 2))
+    """
+    lines = [f"\n  {each.name}={short_text(getattr(record, each.name))}" for each in fields(record)]
+    return f"{type(record).__name__}({','.join(lines)})"
+
+
+def short_text(value: Any) -> str:
+    """A value in at most 60 characters: an array by type and shape, a long collection by its length."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{value.dtype} {tuple(value.shape)}" if value.shape else f"{value}"
+    if isinstance(value, Mapping) and len(value) > 3:
+        return f"{{{next(iter(value))!r}, ...}} ({len(value)} entries)"
+    if isinstance(value, tuple | list) and len(value) > 8:
+        return f"{type(value).__name__} of {len(value)}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _MOST_CHARACTERS else f"{text[: _MOST_CHARACTERS - 3]}..."
+
+
+def html_block(title: str, *parts: str) -> str:
+    """A title above parts, which are HTML."""
+    return f"<div><div><b>{html.escape(title)}</b></div>{''.join(parts)}</div>"
+
+
+def html_lines(lines: Mapping[str, str]) -> str:
+    """One line for each label: the label and its text; nothing without lines."""
+    rows = [(label, text) for label, text in lines.items() if text]
+    return _table(("", ""), rows, header=False) if rows else ""
+
+
+def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of texts.
+
+    Args:
+        headings: one per column.
+        rows: texts of the cells.
+    """
+    return _table(headings, list(rows), header=True)
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], *, header: bool) -> str:
+    import pandas as pd
+
+    # pandas cuts long texts otherwise.
+    with pd.option_context("display.max_colwidth", None):
+        return pd.DataFrame(rows, columns=list(headings)).to_html(index=False, header=header, border=0)
+
 
 #: Heading of a column of positions; each of its cells stays on one line.
 POSITION = "centre (m)"

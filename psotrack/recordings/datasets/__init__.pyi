@@ -1,4 +1,4 @@
-from ._folder_content import videos_in
+from ._folders import find_marker_corners, is_recording, open_recording, videos_in
 from ._marker_corners import (
     MarkerRow,
     read_marker_centres,
@@ -8,13 +8,6 @@ from ._marker_corners import (
     write_marker_corners,
 )
 from ._masks import MASKS, MaskWriter, join_archives
-from ._onboard import (
-    ONBOARD_CALIBRATION,
-    onboard_pose_file,
-    read_onboard,
-    read_onboard_calibration,
-    write_onboard_calibration,
-)
 from ._poses import (
     mocap_markers_file,
     pose_file,
@@ -23,9 +16,19 @@ from ._poses import (
     write_mocap_markers,
     write_poses,
 )
-from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
+from .dpjait import (
+    CALIBRATION,
+    DETECTIONS,
+    MARKER_CORNERS,
+    ONBOARD_CALIBRATION,
+    detection_files,
+    onboard_pose_file,
+    read_onboard,
+    read_onboard_calibration,
+    read_sequence,
+    write_onboard_calibration,
+)
 from .drafting import Draft, DraftOptions, Matching, draft_recording, match_files
-from .opening import find_marker_corners, is_recording, open_recording
 
 __all__ = [
     "CALIBRATION",

@@ -26,7 +26,7 @@ from psotrack.recordings import (
     recording_file_text,
     write_recording_file,
 )
-from psotrack.recordings.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
+from psotrack.recordings.datasets._folders import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
 from psotrack.recordings.datasets.recording_files import recording_of
 from psotrack.support import atomic_write
 

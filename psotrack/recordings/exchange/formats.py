@@ -14,11 +14,18 @@ import numpy as np
 
 from psotrack.errors import InputError, OutputError, SettingsError, errors_name
 from psotrack.recordings import Recording
+from psotrack.recordings.exchange.benchmark_files import (
+    POSES,
+    TRACKS,
+    WORLD,
+    read_kitti,
+    read_mot_positions,
+    write_kitti,
+    write_mot,
+)
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.recordings.exchange.json_files import read_json_tracks, write_json_tracks
-from psotrack.recordings.exchange.kitti_files import POSES, read_kitti, write_kitti
 from psotrack.recordings.exchange.mcap_files import read_mcap, write_mcap
-from psotrack.recordings.exchange.mot_files import TRACKS, WORLD, read_mot_positions, write_mot
 from psotrack.recordings.exchange.timed_paths import interval_s, joined, on_clock, own_interval_s, timed_path
 from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
 from psotrack.support import (
