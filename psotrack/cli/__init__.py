@@ -24,8 +24,7 @@ __all__ = ["cli", "main"]
 
 _COMMANDS = {
     "Start": {
-        **{name: f"start.{name}" for name in ("demo", "run", "board")},
-        "init": "init.init",
+        **{name: f"start.{name}" for name in ("demo", "run", "board", "init")},
         "calibrate": "calibrate.calibrate",
         "doctor": "calibrate.commands.doctor",
         "track": "track.track",
@@ -38,9 +37,7 @@ _COMMANDS = {
     },
     "Research": {
         "simulate": "simulate.simulate",
-        "sweep": "research.sweep",
-        "detect": "detect.detect",
-        "cache": "research.cache",
+        **{name: f"research.{name}" for name in ("sweep", "detect", "cache")},
     },
     "On-board": {"onboard": "onboard.onboard"},
 }

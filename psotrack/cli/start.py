@@ -1,4 +1,4 @@
-"""`psotrack board`, `demo` and `run`: what a newcomer types first."""
+"""`psotrack board`, `demo`, `init` and `run`: what a newcomer types first."""
 
 from __future__ import annotations
 
@@ -8,12 +8,176 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import click
+from msgspec import Meta
 
 from psotrack.cli.commands import command
-from psotrack.cli.options import Jobs, compiled_folder
-from psotrack.cli.output import Output
-from psotrack.cli.types import says
+from psotrack.cli.options import Bodies, Jobs, compiled_folder
+from psotrack.cli.output import Output, check_suffix
+from psotrack.cli.types import SequencePath, Words, says
+
+if TYPE_CHECKING:
+    from psotrack.recordings.datasets import DraftOptions, Matching
+
+
+#: Width of the table in a file or a pipe, characters.
+_WIDE = 200
+
+
+def _pair(match: str) -> tuple[str, str]:
+    """Camera and file of --match."""
+    camera, _, file = match.partition("=")
+    if not (camera and file):
+        raise ValueError
+    return camera, file
+
+
+@command(without=["progress"])
+def init(
+    output: Output,
+    folder: Annotated[Path, says(type=SequencePath(path_type=Path))],
+    *,
+    calibration: Annotated[Path | None, says(metavar="FILE")] = None,
+    unit: Annotated[Literal["m", "cm", "mm"] | None, says(flag="units")] = None,
+    match: Annotated[
+        tuple[tuple[str, str], ...], says(multiple=True, type=Words("CAMERA=FILE", "CAMERA=FILE", _pair))
+    ] = (),
+    leave_out: Annotated[tuple[str, ...], says(multiple=True, metavar="FILE", type=str)] = (),
+    fps: Annotated[float, Meta(gt=0, le=1e6)] | None = None,
+    size_wh: Annotated[tuple[int, int] | None, says(flag="size", metavar="W,H")] = None,
+    out: Annotated[Path | None, says(metavar="FILE")] = None,
+    show: bool = False,
+    bodies: Bodies,
+) -> None:
+    """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
+
+    Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to
+    GoPro 3. Nothing is guessed: where names do not say whose files are, the command asks once on a terminal, for all
+    files; --match and --leave-out answer before.
+    Detections, frame times (frame,time_s), images of what is ignored (a name with "ignore" or "mask"), references and
+    marker corners are found by name and content.
+
+    Without a rig file, the cameras have the names of their files, and no place yet.
+
+    With --show, FOLDER is a recording that is there already: a recording.toml or its folder, a folder of the DPJAIT
+    dataset, or an archive.
+
+    \b
+    Examples:
+      psotrack init my_lab
+      psotrack init my_lab --calibration rig.toml --match left=GX010123.MP4 --leave-out test.mp4
+      psotrack init my_lab --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
+      psotrack init data/Simulated_Data/S02_D4_A --show
+
+    Options:
+        calibration: rig file, of any format that `calibrate convert` reads. None: the one in FOLDER.
+        unit: unit of the lengths in the rig file; needed if the format leaves the unit open.
+        match: FILE of FOLDER, or address of a stream, that belongs to CAMERA; may be repeated.
+        leave_out: file of FOLDER that is not used; may be repeated.
+        fps: frames per second of cameras that have images or detections only.
+        size_wh: size of the images of cameras that have detections only, if the rig file states none or another one.
+        out: file to write. None: FOLDER/recording.toml.
+        show: show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.
+    """
+    from psotrack.recordings import RECORDING_FILE
+    from psotrack.recordings.datasets import DraftOptions, draft_recording
+
+    if show:
+        _show(output, folder, bodies)
+        return
+    out = out or folder / RECORDING_FILE
+    check_suffix("--out", out, ".toml")
+    output.refuse(out)
+    options = DraftOptions(
+        calibration, unit=unit, match=match, leave_out=leave_out, fps=fps, size_wh=size_wh, bodies=bodies
+    )
+    draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
+    for each in draft.recording.cameras:
+        each.check_size()
+    older = draft.write()
+    _say_inventory(output, draft.to_dict())
+    output.say(*str(draft).splitlines())
+    if older is not None:
+        output.say(f"{older}: the file as it was; copy what you had written into it")
+
+
+def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
+    """Show a recording, and check its files."""
+    from psotrack.recordings.datasets import open_recording
+
+    recording = open_recording(sequence, bodies=bodies)
+    for each in recording.cameras:
+        each.check_size()
+    recording.check_detections(recording.detections)
+    if recording.marker_corners is not None:
+        from psotrack.inside_out import read_marker_table
+
+        read_marker_table(recording.marker_corners)
+    _say_inventory(output, recording.to_dict())
+
+
+def _say_inventory(output: Output, content: dict[str, Any]) -> None:
+    from psotrack.recordings import inventory
+
+    output.json(content)
+    title, headings, rows = inventory(content)
+    output.table(headings, rows, title, least_width=_WIDE)
+
+
+def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
+    """The options with what the user answers of the files whose names do not say whose they are.
+
+    Raises:
+        InputError: a line is empty: the error that names these files.
+    """
+    from dataclasses import replace
+
+    from psotrack.recordings.datasets import match_files
+
+    matching = match_files(folder, out, options)
+    questions = matching.questions()
+    if not questions:
+        return options
+    # Numbers of a list beside cameras that are numbers would be read wrongly.
+    numbered = not any(name.isdecimal() for name in matching.cameras)
+    numbers = {f"{number}": name for number, name in enumerate(matching.cameras, 1)} if numbered else {}
+    click.echo("cameras:")
+    for number, name in enumerate(matching.cameras, 1):
+        click.echo(f"  {number}  {name}" if numbered else f"  {name}")
+    click.echo(
+        f"Whose are these {len(questions)} files? A camera's {'number or ' if numbered else ''}name; "
+        "- leaves a file out; an empty line ends without any change."
+    )
+    matched, left_out = [*options.match], [*options.leave_out]
+    for path, (_, found) in questions.items():
+        file = os.path.relpath(path, folder)
+        answer = _answer(f"  {file} ({found}): ", matching, numbers)
+        if answer == "-":
+            left_out.append(file)
+        else:
+            matched.append((answer, file))
+    return replace(options, match=matched, leave_out=left_out)
+
+
+def _answer(question: str, matching: Matching, numbers: dict[str, str]) -> str:
+    """The camera of a file, or "-"."""
+    from psotrack.geometry import chosen_camera
+
+    while True:
+        try:
+            answer = input(question).strip()
+        except EOFError:
+            answer = ""
+        if not answer:
+            raise matching.error()
+        camera = numbers.get(answer) or chosen_camera(answer, matching.cameras)
+        if answer == "-" or camera is not None:
+            return camera or answer
+        if matching.calibration is None:
+            return answer
+        click.echo(f"  expected a camera of {matching.calibration.name}, or -, found {answer}")
 
 
 @command(without=["progress", "json_path"])
@@ -132,7 +296,6 @@ def run(
         again: do all steps again, also those that are done.
     """
     from psotrack import api
-    from psotrack.cli.init import asked
     from psotrack.recordings import RECORDING_FILE
     from psotrack.recordings.datasets import DraftOptions, videos_in
     from psotrack.support import keep_compiled

@@ -1,6 +1,15 @@
 from .array_checks import first_repeat, first_repeated, first_true, has_negative_eigenvalue
 from .calls import check_records, checked
-from .compiled import as_written, drop_programs_if_many, keep_compiled, measured_compiling
+from .compiled import (
+    Device,
+    as_written,
+    drop_programs_if_many,
+    keep_compiled,
+    measured_compiling,
+    processors,
+    share_processors,
+    use_device,
+)
 from .delimited import (
     Column,
     Table,
@@ -13,7 +22,6 @@ from .delimited import (
     read_table,
     write_rows,
 )
-from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, FAINT, INK, LINE, STYLE, drone_colour, save_figure
 from .files import (
     ARCHIVE_SUFFIX,
