@@ -110,14 +110,9 @@ def _box(row: TextRow, start: int) -> tuple[float, ...]:
             raise row.error(columns[name], f"a size {name} of 0 or more pixels", f"{value[name]:g}")
     if not 0 <= value["confidence"] <= 1:
         raise row.error(columns["confidence"], "a confidence from 0 to 1", f"{value['confidence']:g}")
-    half_w, half_h = value["w"] / 2, value["h"] / 2
-    return (
-        value["cx"] - half_w,
-        value["cy"] - half_h,
-        value["cx"] + half_w,
-        value["cy"] + half_h,
-        value["confidence"],
-    )
+    middle = np.array([value["cx"], value["cy"]])
+    half = np.array([value["w"], value["h"]]) / 2
+    return *(middle - half), *(middle + half), value["confidence"]
 
 
 def _column(index: int) -> Column:

@@ -12,7 +12,6 @@ import struct
 import tempfile
 import threading
 import warnings
-import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -34,7 +33,9 @@ _OF_LIBJPEG = (
     b"Corrupt JPEG data", b"Premature end of JPEG", b"Invalid SOS", b"Inconsistent progression", b"Unknown Adobe color",
     b"Warning: unknown JFIF", b"Invalid progressive",
 )  # fmt: skip
-#: stderr is the process's: JPEGs are decoded one after the other, so that each has its own messages.
+#: How those of libpng begin.
+_OF_LIBPNG = b"libpng "
+#: stderr is the process's: images are decoded one after the other, so that each has its own messages.
 _decoding = threading.Lock()
 
 
@@ -72,44 +73,10 @@ def silence_opencv() -> AbstractContextManager[None]:
     """Suppress the messages of OpenCV and FFmpeg about a file that is opened, decoded or written in this block.
 
     Errors replace them. Libraries that write to the terminal themselves, such as libjpeg, are not silenced: see
-    `decode_jpeg`. FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user
+    `_decode`. FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user
     has set is kept.
     """
     return _silence
-
-
-def decode_jpeg(
-    coded: UInt8[np.ndarray, " bytes"], flags: int, where: object
-) -> Shaped[np.ndarray, "..."] | None:
-    """Decode a JPEG; None if OpenCV cannot.
-
-    libjpeg writes about damaged images straight to stderr. Its first line becomes a warning with the name of the
-    image; what else was written meanwhile, by other threads, goes to stderr afterwards.
-
-    Args:
-        coded: content of a JPEG file.
-        flags: flags of `cv2.imdecode`.
-        where: the file, for the warning.
-    """
-    with _decoding, silence_opencv(), tempfile.TemporaryFile() as taken:
-        stderr = os.dup(2)
-        try:
-            os.dup2(taken.fileno(), 2)
-            image = cv2.imdecode(coded, flags)
-        except cv2.error:
-            image = None
-        finally:
-            os.dup2(stderr, 2)
-            taken.seek(0)
-            lines = taken.read().splitlines(keepends=True)
-            os.write(stderr, b"".join(line for line in lines if not line.startswith(_OF_LIBJPEG)))
-            os.close(stderr)
-    if image is None:
-        return None
-    said = next((line.decode().strip() for line in lines if line.startswith(_OF_LIBJPEG)), None)
-    if said is not None:
-        logger.warning("%s is damaged (%s)", where, said)
-    return np.asarray(image)
 
 
 #: Endings of files that are read as images.
@@ -120,9 +87,8 @@ _FORMATS = ("JPEG", "BMP", "TIFF", "WEBP", "PPM")
 MOST_PIXELS = 178_956_970
 #: Longest side of an image, pixels: OpenCV warps no larger ones.
 MOST_SIDE = 2**15 - 2
-#: First bytes of a JPEG and of a PNG, and least size of a PNG's parts: length, name and checksum.
-_JPEG = b"\xff\xd8"
-_PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
+#: First bytes of a PNG, and number of bytes up to the end of its size.
+_PNG, _PNG_HEAD = b"\x89PNG\r\n\x1a\n", 24
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -205,32 +171,36 @@ def is_image(path: Path) -> bool:
 
 
 def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
+    """Decode an image file, whose damage becomes a warning where OpenCV decodes the rest.
+
+    libjpeg and libpng write about damaged images straight to stderr. libjpeg's first line becomes the warning; what
+    else was written meanwhile, by other threads, goes to stderr afterwards.
+    """
     with system_errors(path, "an image"):
         coded = np.fromfile(path, np.uint8)
-    return image_of(coded, flags, path)
-
-
-def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> Shaped[np.ndarray, "..."]:
-    """Decode the content of an image file.
-
-    Args:
-        coded: the content.
-        flags: flags of `cv2.imdecode`.
-        where: the file, for messages.
-
-    Raises:
-        InputError: the content is no image of a format that psotrack reads, or would take gigabytes.
-    """
-    size_wh = _claimed_size_wh(coded.tobytes(), where)
-    check_pixels(where, *size_wh)
+    data = coded.tobytes()
+    check_pixels(path, *_claimed_size_wh(data, path))
     image: Shaped[np.ndarray, "..."] | None = None
-    if coded[: len(_JPEG)].tobytes() == _JPEG:
-        image = decode_jpeg(coded, flags, where)
-    else:
-        with contextlib.suppress(cv2.error), silence_opencv():
-            image = cv2.imdecode(coded, flags)
+    with _decoding, silence_opencv(), tempfile.TemporaryFile() as taken:
+        stderr = os.dup(2)
+        try:
+            os.dup2(taken.fileno(), 2)
+            with contextlib.suppress(cv2.error):
+                image = cv2.imdecode(coded, flags)
+        finally:
+            os.dup2(stderr, 2)
+            taken.seek(0)
+            lines = taken.read().splitlines(keepends=True)
+            own = (_OF_LIBPNG, *_OF_LIBJPEG)
+            os.write(stderr, b"".join(line for line in lines if not line.startswith(own)))
+            os.close(stderr)
     if image is None:
-        raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
+        is_png = data.startswith(_PNG)
+        found = "a PNG that is cut short or damaged" if is_png else "a file that OpenCV cannot decode"
+        raise InputError(path, expected="an image", found=found)
+    said = next((line.decode().strip() for line in lines if line.startswith(_OF_LIBJPEG)), None)
+    if said is not None:
+        logger.warning("%s is damaged (%s)", path, said)
     return np.asarray(image)
 
 
@@ -248,10 +218,8 @@ def check_pixels(where: object, width: int, height: int) -> None:
 def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
     """Width and height that the header of an image states, before OpenCV asks for the memory that they take."""
     # Pillow refuses a PNG whose notes are damaged, too.
-    if data.startswith(_PNG):
-        if not _is_whole_png(data):
-            raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
-        return struct.unpack_from(">II", data, 16)
+    if data.startswith(_PNG) and len(data) >= _PNG_HEAD:
+        return struct.unpack_from(">II", data, _PNG_HEAD - 8)
     try:
         with warnings.catch_warnings():
             # OpenCV decides whether the rest of a damaged file can be read.
@@ -265,26 +233,6 @@ def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
     except Exception as error:
         found = f"a file that is no PNG, {', '.join(_FORMATS)}, or a damaged one"
         raise InputError(where, expected="an image", found=found) from error
-
-
-def _is_whole_png(data: bytes) -> bool:
-    """Whether a PNG's parts up to its end are there, and those that an image needs fit their checksums.
-
-    libpng writes about parts that do not straight to the terminal, which no setting of OpenCV prevents.
-    """
-    at, name = len(_PNG), b""
-    while name != b"IEND":
-        end = at + _PNG_PART + int.from_bytes(data[at : at + 4])
-        if end > len(data):
-            return False
-        name = data[at + 4 : at + 8]
-        checksum = int.from_bytes(data[end - 4 : end])
-        # The name of a part that an image needs begins with a capital letter.
-        if name[:1].isupper() and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != checksum:
-            return False
-        at = end
-    # The size is in the first part.
-    return len(data) >= len(_PNG) + 2 * _PNG_PART
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:

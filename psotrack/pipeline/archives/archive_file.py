@@ -255,9 +255,6 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with system_errors(path, "an archive of psotrack"):
             zipped = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
-        raise _damaged(path, error) from error
-    try:
         with zipped:
             entries = zipped.infolist()
             if any(entry.header_offset < 0 for entry in entries):

@@ -6,7 +6,6 @@ The names in the published archives are unknown. Here images are called `cam1i/d
 
 from __future__ import annotations
 
-import functools
 import struct
 import zipfile
 import zlib
@@ -48,8 +47,8 @@ class MaskWriter:
             frame: number of the frame, from 0.
             mask: (height, width), True where the drone is seen.
         """
-        png = _png(mask) if mask.any() else _empty_png(*mask.shape)
-        self._archive.writestr(_stored_entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
+        entry = _stored_entry(f"{camera}/dron{drone}/{frame:06d}.png")
+        self._archive.writestr(entry, _png(mask))
 
     def __exit__(self, *error: object) -> None:
         self._archive.close()
@@ -94,8 +93,3 @@ def _png(mask: Mask) -> bytes:
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-@functools.lru_cache(maxsize=4)
-def _empty_png(height: int, width: int) -> bytes:
-    return _png(np.zeros((height, width), bool))
