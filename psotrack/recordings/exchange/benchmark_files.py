@@ -21,7 +21,6 @@ visibility` (Milan et al. 2016), which serves every benchmark of TrackEval.
 from __future__ import annotations
 
 import configparser
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage, boxes_in_camera, camera_frames
 from psotrack.recordings.exchange.timed_paths import interval_s, timed_path
-from psotrack.support import Report, check_file_name, first_repeat, first_true, read_numbers
+from psotrack.support import Report, check_file_name, first_repeat, first_true, read_numbers, write_rows
 from psotrack.trajectories import UNASSIGNED, DroneRows, Trajectories, from_rows
 from psotrack.trajectories.association import align, fixed_identity
 
@@ -41,10 +40,8 @@ POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
 _ROTATION = 1e-4
 
 
-def write_kitti(
-    folder: Path, trajectories: Trajectories, footage: Footage | None, report: Report
-) -> list[str]:
-    """Write the poses and times of each drone into a new folder; nothing is missing in it.
+def write_kitti(folder: Path, trajectories: Trajectories, footage: Footage | None, report: Report) -> None:
+    """Write the poses and times of each drone into a new folder.
 
     Raises:
         InputError: a drone's name cannot be the name of a file.
@@ -55,9 +52,8 @@ def write_kitti(
         poses = np.zeros((int(seen.sum()), 3, 4))
         poses[:, :, :3] = _rotations(trajectories, drone)
         poses[:, :, 3] = trajectories.position_m[seen, drone]
-        _write(folder / POSES / f"{name}.txt", poses.reshape(-1, 12))
-        _write(folder / SEQUENCES / name / TIMES, trajectories.time_s[seen].astype(float)[:, None])
-    return []
+        write_rows(folder / POSES / f"{name}.txt", poses.reshape(-1, 12).tolist(), " ")
+        write_rows(folder / SEQUENCES / name / TIMES, trajectories.time_s[seen, None].tolist())
 
 
 def find_times(file: Path) -> Path | None:
@@ -130,12 +126,6 @@ def _rotations(trajectories: Trajectories, drone: int) -> Float[np.ndarray, "row
     return Rotation.from_quat(orientation[seen, drone].astype(float), scalar_first=True).as_matrix()
 
 
-def _write(path: Path, rows: Float[np.ndarray, "rows columns"]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    lines = [" ".join(map(repr, row)) + "\n" for row in rows.tolist()]
-    path.write_text("".join(lines), encoding="ascii")
-
-
 #: The folder of TrackEval: with the benchmark MOT15, TrackEval leaves nothing out.
 BENCHMARK, SPLIT, TRACKER = "MOT15", "train", "psotrack"
 WORLD, TRACKS, REFERENCE, INFO = "3d", "tracks.txt", "reference.txt", "seqinfo.ini"
@@ -160,12 +150,11 @@ def write_mot(path: Path, trajectories: Trajectories, footage: Footage | None, r
 
 def write_mot_positions(path: Path, trajectories: Trajectories) -> None:
     """Write positions in MOT15's 3D columns; drones have the numbers 1, 2, ... in their order."""
-    lines = []
-    for row, drone in np.argwhere(trajectories.seen):
-        x, y, z = (str(value) for value in trajectories.position_m[row, drone])
-        lines.append(f"{trajectories.frame[row] + 1},{drone + 1},-1,-1,-1,-1,1,{x},{y},{z}\n")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(lines), encoding="ascii")
+    rows = (
+        (trajectories.frame[row] + 1, drone + 1, -1, -1, -1, -1, 1, *trajectories.position_m[row, drone])
+        for row, drone in np.argwhere(trajectories.seen)
+    )
+    write_rows(path, rows, ",")
 
 
 def _write_folder(folder: Path, trajectories: Trajectories, footage: Footage, report: Report) -> list[str]:
@@ -199,15 +188,13 @@ def _write_folder(folder: Path, trajectories: Trajectories, footage: Footage, re
             size_wh = recording.rig.cameras.image_size_wh[recording.rig.names.index(camera)].astype(int)
             _write_info(sequence, name, times.fps, times.num_frames, size_wh.tolist())
             boxes = boxes_in_camera(recording, camera, times, trajectories, size_m)
-            _write_boxes(folder / "trackers" / split / TRACKER / "data" / f"{name}.txt", boxes, ",-1,-1,-1")
+            _write_boxes(folder / "trackers" / split / TRACKER / "data" / f"{name}.txt", boxes, (-1, -1, -1))
             if truth is not None:
                 truth_m = _reference_sizes(trajectories, truth, size_m)
                 boxes = boxes_in_camera(recording, camera, times, truth, truth_m)
-                _write_boxes(sequence / "gt" / "gt.txt", boxes, ",1,1")
+                _write_boxes(sequence / "gt" / "gt.txt", boxes, (1, 1))
             advance(1)
-    maps = folder / "gt" / "seqmaps" / f"{split}.txt"
-    maps.parent.mkdir(parents=True, exist_ok=True)
-    maps.write_text("".join(f"{name}\n" for name in ("name", *names)), encoding="utf-8")
+    write_rows(folder / "gt" / "seqmaps" / f"{split}.txt", [[name] for name in ("name", *names)])
     return [] if truth is not None else ["boxes of a reference, because SEQ has none"]
 
 
@@ -291,22 +278,18 @@ def _reference_sizes(
     return sizes
 
 
-def _write_boxes(path: Path, xyxy: Float[np.ndarray, "frames drones 4"], end: str) -> None:
+def _write_boxes(path: Path, xyxy: Float[np.ndarray, "frames drones 4"], end: tuple[int, ...]) -> None:
     """Write boxes with a thousandth of a pixel; the left column of the image is 1."""
-    lines = []
+    rows = []
     for frame, drone in np.argwhere(np.isfinite(xyxy).all(axis=-1)):
         x0, y0, x1, y1 = xyxy[frame, drone]
-        numbers: Iterable[float] = (x0 + 1, y0 + 1, x1 - x0, y1 - y0)
-        box = ",".join(f"{number:.3f}" for number in numbers)
-        lines.append(f"{frame + 1},{drone + 1},{box},1{end}\n")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(lines), encoding="ascii")
+        box = (f"{number:.3f}" for number in (x0 + 1, y0 + 1, x1 - x0, y1 - y0))
+        rows.append((frame + 1, drone + 1, *box, 1, *end))
+    write_rows(path, rows, ",")
 
 
 def _write_info(folder: Path, name: str, fps: float, frames: int, size_wh: list[int] | None) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    values = {"name": name, "imDir": "img1", "frameRate": repr(float(fps)), "seqLength": frames}
+    values = {"name": name, "imDir": "img1", "frameRate": float(fps), "seqLength": frames}
     if size_wh is not None:
         values |= {"imWidth": size_wh[0], "imHeight": size_wh[1], "imExt": ".jpg"}
-    lines = ["[Sequence]", *(f"{key}={value}" for key, value in values.items())]
-    (folder / INFO).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_rows(folder / INFO, [["[Sequence]"], *values.items()], "=")

@@ -45,9 +45,7 @@ from psotrack.trajectories.tum import read_tum, tum_text, write_tum
 _ONE_RATE = 1e-3
 
 
-def write_c3d_tracks(
-    path: Path, trajectories: Trajectories, footage: Footage | None, report: Report
-) -> list[str]:
+def write_c3d_tracks(path: Path, trajectories: Trajectories, footage: Footage | None, report: Report) -> None:
     """Write one point per drone; frames in which a drone is not seen have a residual of -1.
 
     Raises:
@@ -61,7 +59,6 @@ def write_c3d_tracks(
     position_m = np.full((frames, trajectories.num_drones, 3), np.nan)
     position_m[trajectories.frame] = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
     write_c3d(path, Markers(trajectories.drones, position_m, 1 / interval_s(trajectories)))
-    return []
 
 
 def read_c3d_tracks(path: Path, recording: Recording | None) -> Trajectories:
@@ -97,8 +94,8 @@ _POSES = frozenset({NAMES, TIMES, "orientations"})
 _ALL = frozenset({NAMES, TIMES, *PHRASES, STATUS})
 #: Numbers per line of a TUM file and of a KITTI file; more than 6 with commas are MOT.
 _TUM, _KITTI = 8, 12
-#: Writes tracks to a path, and returns what is missing in it as noun phrases.
-Write = Callable[[Path, Trajectories, Footage | None, Report], list[str]]
+#: Writes tracks to a path, and returns what is missing in it as noun phrases, if there is any.
+Write = Callable[[Path, Trajectories, Footage | None, Report], list[str] | None]
 Read = Callable[[Path, Recording | None], Trajectories]
 
 
@@ -124,17 +121,15 @@ class TrackFormat:
     needs_all: bool = False
 
 
-def _write_tum(path: Path, tracks: Trajectories, footage: Footage | None, report: Report) -> list[str]:
+def _write_tum(path: Path, tracks: Trajectories, footage: Footage | None, report: Report) -> None:
     if path.suffix in FORMATS["tum"].suffixes:
         path.write_text(tum_text(tracks, 0), encoding="utf-8")
     else:
         write_tum(path, tracks)
-    return []
 
 
-def _write_table(path: Path, tracks: Trajectories, footage: Footage | None, report: Report) -> list[str]:
+def _write_table(path: Path, tracks: Trajectories, footage: Footage | None, report: Report) -> None:
     write_trajectories(path, tracks)
-    return []
 
 
 #: The formats by name.
@@ -299,7 +294,7 @@ def export_tracks(
         if footage is not None and footage.size_m is not None:
             footage = replace(footage, size_m=footage.size_m[kept])
     with atomic_write(out) as temporary:
-        lost += form.write(temporary, trajectories, footage, report)
+        lost += form.write(temporary, trajectories, footage, report) or []
     return tuple(lost)
 
 

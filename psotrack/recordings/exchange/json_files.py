@@ -22,7 +22,7 @@ _STATUS = {status.label: int(status) for status in Status}
 
 def write_json_tracks(
     path: Path, trajectories: Trajectories, footage: Footage | None, report: Report
-) -> list[str]:
+) -> None:
     """Write all quantities of trajectories; numbers have all digits."""
     known = trajectories.quantities()
     content = {
@@ -38,7 +38,6 @@ def write_json_tracks(
         ],
     }
     path.write_text(json.dumps(content, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
-    return []
 
 
 def read_json_tracks(path: Path) -> Trajectories:
