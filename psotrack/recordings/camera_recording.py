@@ -140,14 +140,9 @@ class CameraRecording:
     def first(self, num_frames: int) -> CameraRecording:
         """The first frames only."""
         video, stored, times = self.video, self.silhouettes, self.times
-        return replace(
-            self,
-            video=None if video is None else replace(video, num_frames=num_frames),
-            silhouettes=None
-            if stored is None
-            else replace(stored, num_frames=min(num_frames, stored.num_frames)),
-            times=None if times is None else times.cut(num_frames),
-        )
+        video = video and replace(video, num_frames=num_frames)
+        stored = stored and replace(stored, num_frames=min(num_frames, stored.num_frames))
+        return replace(self, video=video, silhouettes=stored, times=times and times.cut(num_frames))
 
     def with_detections(self, path: Path | None) -> CameraRecording:
         """The same with another file of detections; a camera that shows nothing else lasts until the last of them.

@@ -28,11 +28,9 @@ def inventory_html(content: dict[str, Any]) -> str:
 def _heading(content: dict[str, Any]) -> str:
     """Name, length and reference of a recording."""
     drones = content["drones"]
-    reference = (
-        f"reference of {', '.join(drones)} in {content['frames_with_truth']} frames"
-        if drones is not None
-        else "no reference"
-    )
+    reference = "no reference"
+    if drones is not None:
+        reference = f"reference of {', '.join(drones)} in {content['frames_with_truth']} frames"
     length = f"{content['instants']} instants at {content['rate_hz']:g} Hz, " if content["rate_hz"] else ""
     return f"{content['name']}: {length}{reference}"
 

@@ -252,7 +252,10 @@ class Recording:
 
     def with_rig(self, rig: Rig) -> Recording:
         """This recording with other lenses and places of the cameras that a rig has."""
-        known = {name: rig.cameras[index] for index, name in enumerate(rig.names)}
+        return self.with_cameras({name: rig.cameras[index] for index, name in enumerate(rig.names)})
+
+    def with_cameras(self, known: Mapping[str, Camera]) -> Recording:
+        """This recording with other lenses and places of some cameras, by their names."""
         cameras = (replace(each, camera=known.get(each.name, each.camera)) for each in self.cameras)
         return replace(self, cameras=tuple(cameras))
 
@@ -390,13 +393,9 @@ def recording_of_video(video: VideoInfo) -> Recording:
 
 def with_all_videos(recording: Recording) -> Recording:
     """The recording with a lens and a place for each camera that has a video; never to be used for positions."""
-    cameras = (
-        replace(each, camera=_stand_in(each.video))
-        if each.camera is None and each.video is not None
-        else each
-        for each in recording.cameras
-    )
-    return replace(recording, cameras=tuple(cameras))
+    lacking = {each.name: each.video for each in recording.cameras if each.camera is None and each.video}
+    stand_ins = {name: _stand_in(video) for name, video in lacking.items()}
+    return recording.with_cameras(stand_ins)
 
 
 def _stand_in(video: VideoInfo) -> Camera:

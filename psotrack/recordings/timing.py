@@ -308,13 +308,10 @@ def _check_length(frame_times: Mapping[str, FrameTimes], rate_hz: float) -> None
     if end_s * rate_hz <= MOST_INSTANTS:
         return
     found = f"{end_s * rate_hz:.2g}: {rate_hz:g} Hz until {end_s:.2f} s, when camera {last} ends"
-    late = begin_s > end_s - begin_s
-    remedy = (
-        f"the clock must begin with the recording: subtract {begin_s:.2f} s, the time of the first frame of camera "
-        f"{first}, from all times"
-        if late
-        else "check the rates and times of the cameras"
-    )
+    remedy = "check the rates and times of the cameras"
+    if begin_s > end_s - begin_s:
+        of_first = f"{begin_s:.2f} s, the time of the first frame of camera {first}, from all times"
+        remedy = f"the clock must begin with the recording: subtract {of_first}"
     raise InputError(
         "frame times", expected=f"at most {MOST_INSTANTS} instants from time 0 on", found=found, remedy=remedy
     )

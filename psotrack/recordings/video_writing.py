@@ -193,16 +193,16 @@ def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
     Raises:
         OutputError: a frame or the index of frames is missing, or there is no frame.
     """
+    if not num_frames:
+        raise OutputError(path, expected="at least one frame", found="0 written")
     # The header may count frames that are missing: count the frames themselves.
-    found = len(packet_times(temporary)) if num_frames else 0
-    if found != num_frames or found == 0 or not _has_its_end(temporary):
+    found = len(packet_times(temporary))
+    if found != num_frames or not _has_its_end(temporary):
         raise OutputError(
             path,
-            expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
-            found=f"{found} written"
-            if found != num_frames or found == 0
-            else "an incomplete index of frames",
-            remedy="is the disk full? earlier results are unchanged" if num_frames else "",
+            expected=f"a file with {num_frames} frames",
+            found=f"{found} written" if found != num_frames else "an incomplete index of frames",
+            remedy="is the disk full? earlier results are unchanged",
         )
 
 

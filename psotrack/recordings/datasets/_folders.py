@@ -224,11 +224,9 @@ def _no_recording(path: Path) -> InputError:
         below = sorted(inner for inner in path.iterdir() if any((inner / name).is_file() for name in names))
     except OSError:
         return InputError(path, expected=expected, found="a folder without read permission")
-    remedy = (
-        f"did you mean {below[0]}?"
-        if below
-        else f"`psotrack init {path}` writes a {RECORDING_FILE} for your own videos"
+    found, remedy = (
+        f"neither {RECORDING_FILE} nor {CALIBRATION}",
+        f"did you mean {below[0]}?" if below else "",
     )
-    return InputError(
-        path, expected=expected, found=f"neither {RECORDING_FILE} nor {CALIBRATION}", remedy=remedy
-    )
+    remedy = remedy or f"`psotrack init {path}` writes a {RECORDING_FILE} for your own videos"
+    return InputError(path, expected=expected, found=found, remedy=remedy)

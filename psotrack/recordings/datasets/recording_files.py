@@ -351,10 +351,8 @@ def _check_names(
             taken[entry] = name
     alone = [name for name, entry in known.items() if entry is None and content.cameras[name].K is None]
     unused = [entry for entry in stated if entry not in taken]
-    rig_file, remedy = (
-        Path(content.calibration or "").name,
-        "`psotrack init --force --match CAMERA=FILE` maps them",
-    )
+    rig_file = Path(content.calibration or "").name
+    remedy = "`psotrack init --force --match CAMERA=FILE` maps them"
     if alone and not taken:
         expected = f"a camera of the recording, {', '.join(known)}, in {rig_file}"
         raise file_error(path, "calibration", expected, f"only {', '.join(stated)}", remedy)

@@ -75,15 +75,16 @@ def drone_markers(
     others = [name for name, fault in faults.items() if fault and len(bodies[name]) >= _FEWEST]
     if not rigid or others:
         most = _SHOWN if len(bodies) == 1 else _SHOWN_OF_MANY
+        found = "; ".join(
+            f"{name}, {faults[name] or 'rigid'} ({_shown(markers, columns, most)})"
+            for name, columns in bodies.items()
+        )
+        if not any(bodies.values()):
+            found = f"unidentified markers only ({_shown(markers, range(len(markers.labels)))})"
         raise NoDronesError(
             where,
             expected=f"drones, rigid bodies of {_FEWEST} to {_MOST} markers",
-            found="; ".join(
-                f"{name}, {faults[name] or 'rigid'} ({_shown(markers, columns, most)})"
-                for name, columns in bodies.items()
-            )
-            if any(bodies.values())
-            else f"unidentified markers only ({_shown(markers, range(len(markers.labels)))})",
+            found=found,
             remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies], or leave "
             "the file out",
         )
@@ -112,13 +113,10 @@ def _named_markers(markers: Markers, where: Path | str, name: str, labels: Seque
             own = [index for index, each in enumerate(markers.labels) if each.rpartition(":")[2] == label]
             fitting = fitting or own
         if not fitting or (len(fitting) > 1 and not whole):
-            raise SettingsError(
-                f"body {name}, {where}",
-                expected=f"one marker called {label!r}"
-                if fitting
-                else f"labels of {', '.join(known.values())}",
-                found=f"{len(fitting)}" if fitting else repr(label),
-            )
+            expected, found = f"labels of {', '.join(known.values())}", repr(label)
+            if fitting:
+                expected, found = f"one marker called {label!r}", f"{len(fitting)}"
+            raise SettingsError(f"body {name}, {where}", expected=expected, found=found)
         columns += [index for index in fitting if index not in columns]
     fault = _fault(markers, columns)
     if fault:
