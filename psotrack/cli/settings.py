@@ -1,7 +1,8 @@
 """Settings of tracking as options, and archives as sequences, whose settings `track` uses again.
 
 There is an option for each setting, --config and --save-config. A setting is found in this order: what is typed, the
-file of --config, the archive that is tracked again, the default."""
+file of --config, the archive that is tracked again, the default.
+"""
 
 from __future__ import annotations
 

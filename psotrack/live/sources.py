@@ -1,7 +1,8 @@
 """The cameras of a session, and their sources of frames: a device, the address of a stream, or a video that is played.
 
 A source yields frames with their times on the recording's clock. The frames of a stream are timed by the stream's own
-times, or else when they arrive. A stream that breaks off is opened again, once per second."""
+times, or else when they arrive. A stream that breaks off is opened again, once per second.
+"""
 
 from __future__ import annotations
 

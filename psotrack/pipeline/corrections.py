@@ -1,5 +1,6 @@
 """What the tracks of a run show of its cameras, and the recording for a second pass: clocks that are wrong, and cameras
-that are knocked in mid-flight."""
+that are knocked in mid-flight.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """What a run has before it tracks: parts that the caller brings, cameras and detections that its settings can use.
 
-A method is given to `psotrack.track(..., method=...)`, or by name as a plugin (see `psotrack.support.plugins`)."""
+A method is given to `psotrack.track(..., method=...)`, or by name as a plugin (see `psotrack.support.plugins`).
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """`CameraRecording`: what a recording has of one camera; stored silhouettes take the place of a video.
 
 The room `silhouettes` makes and reads the arrays of silhouettes. Here only their description is read: a recording needs
-to know how many frames there are, and from what the silhouettes were made."""
+to know how many frames there are, and from what the silhouettes were made.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """JAX: the devices on which it computes, and its compiled programs.
 
 Compiled programs have the settings that they are written for, a cache on disk, and a bound on those in memory. The time
-that JAX takes to compile is measured, because figures of speed count it apart from the work."""
+that JAX takes to compile is measured, because figures of speed count it apart from the work.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Tables in delimited text (CSV), and lines of numbers, with error messages that name file, line and column.
 
 The readers accept a byte order mark, Windows line ends, spaces, a separator at the end of a line, blank lines, and
-upper case in the header. They refuse a decimal comma, because 1,156 may also mean 1156."""
+upper case in the header. They refuse a decimal comma, because 1,156 may also mean 1156.
+"""
 
 from __future__ import annotations
 

@@ -5,7 +5,8 @@ of its files, and an archive that was cut short. Dates are fixed and files have 
 bytes.
 
 An archive may come from anybody. Names that lead out of the folder, two files of one name, and files that unpack to far
-more than the archive has are refused. The folder gets its name when everything was unpacked and checked."""
+more than the archive has are refused. The folder gets its name when everything was unpacked and checked.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """What lies in a folder, found by name and content; and one function that opens any recording.
 
-A recording is a `recording.toml`, a folder that holds one, or a folder of a dataset."""
+A recording is a `recording.toml`, a folder that holds one, or a folder of a dataset.
+"""
 
 from __future__ import annotations
 

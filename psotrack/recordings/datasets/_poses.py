@@ -5,7 +5,8 @@ In `dronN_pos_25.csv`, the poses of one simulated drone, row i belongs to video 
 reader uses four columns that end in `w`, `x`, `y`, `z` after a word with a `q` (`q_w`, `qw`, `quat_w`, ...) as the
 quaternion, which turns body into world coordinates. Euler angles are not read: beside a quaternion they are redundant,
 and without a quaternion their order would be a guess. The written columns are `rot_x[rad]`, `rot_y[rad]`, `rot_z[rad]`,
-with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`, `q_z`."""
+with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`, `q_z`.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The formats of tracks: what each can hold, how it is written, and how a file or a folder of it is read.
 
 A format is written whole or not at all. In C3D (see `recordings.c3d`), a drone is one point, in millimetres, in every
-frame from frame 0 on."""
+frame from frame 0 on.
+"""
 
 from __future__ import annotations
 

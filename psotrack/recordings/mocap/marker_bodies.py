@@ -1,6 +1,7 @@
 """Trajectories of bodies from the markers that they carry: the reference of a motion-capture recording.
 
-Which markers are a drone's is said by the user, by their labels, or by being rigid."""
+Which markers are a drone's is said by the user, by their labels, or by being rigid.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 Each drone of the DPJAIT dataset carries four or five markers that form an asymmetric cross. Rigid fits are least
 squares (Kabsch 1976; Umeyama 1991, without scale); the shape is a generalised Procrustes mean (Gower 1975). In the
-poses over time, labels are corrected from the distances, and short gaps are bridged."""
+poses over time, labels are corrected from the distances, and short gaps are bridged.
+"""
 
 from __future__ import annotations
 
