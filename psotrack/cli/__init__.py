@@ -133,6 +133,5 @@ def _complete() -> None:
     from click.shell_completion import shell_complete
 
     if shell_complete(cli, {}, "psotrack", _COMPLETION_VARIABLE, instruction) != 0:
-        expected = "bash_source, zsh_source or fish_source"
-        raise SettingsError(_COMPLETION_VARIABLE, expected=expected, found=instruction)
+        raise SettingsError(_COMPLETION_VARIABLE, "bash_source, zsh_source or fish_source", instruction)
     sys.exit(0)

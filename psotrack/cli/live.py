@@ -104,8 +104,7 @@ def live(
     from psotrack.trajectories import RowStream
 
     if not (out or lines or udp or websocket or view):
-        expected = "--out FILE, --lines, --udp, --websocket or --view"
-        raise SettingsError("--out", expected=expected, found="none of them")
+        raise SettingsError("--out", "--out FILE, --lines, --udp, --websocket or --view", "none of them")
     if out is not None:
         check_suffix("--out", out, ".csv")
         output.refuse(out, out.with_suffix(".json"))

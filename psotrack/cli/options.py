@@ -54,9 +54,9 @@ def _read_bodies(_: click.Context, __: click.Parameter, given: tuple[str, ...]) 
             tuple(label.strip() for label in labels.split(",") if label.strip()) if equals else (f"{name}:",)
         )
         if not name or not chosen:
-            raise SettingsError("--body", expected="NAME=LABEL,LABEL,... or NAME", found=each)
+            raise SettingsError("--body", "NAME=LABEL,LABEL,... or NAME", each)
         if name in bodies:
-            raise SettingsError("--body", expected="each drone once", found=f"{name} twice")
+            raise SettingsError("--body", "each drone once", f"{name} twice")
         bodies[name] = chosen
     return bodies
 
@@ -77,7 +77,7 @@ Bodies = Annotated[
 
 def _check_picture(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and path.name and path.suffix.lower() != ".png":
-        raise SettingsError("--plot", expected="a file that ends in .png", found=path.name)
+        raise SettingsError("--plot", "a file that ends in .png", path.name)
     return path
 
 
@@ -113,9 +113,7 @@ def filmed_recording(source: Path, extent: Extent) -> Recording:
     from psotrack.recordings.datasets import is_recording, open_recording
 
     if not source.exists():
-        raise InputError(
-            source, expected="a video, a folder of pictures, or a recording", found="no such file or folder"
-        )
+        raise InputError(source, "a video, a folder of pictures, or a recording", "no such file or folder")
     if not is_recording(source) and (source.is_file() or is_picture_folder(source)):
         # Nothing that is made from the pictures depends on their rate.
         recording = recording_of_video(open_video(source, 1.0 if is_picture_folder(source) else None))
@@ -163,10 +161,7 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
     found = given or find_recording(tracks)
     if found is None:
         raise InputError(
-            tracks,
-            expected="a record beside the tracks that names their recording",
-            found="none",
-            remedy="name SEQ",
+            tracks, "a record beside the tracks that names their recording", "none", remedy="name SEQ"
         )
     return found
 

@@ -102,8 +102,7 @@ def detect(
     wanted = {f"--{name}": value for name, value in vars(what).items()}
     given = [name for name, value in wanted.items() if value]
     if len(given) != 1:
-        found = " and ".join(given) or "none of them"
-        raise SettingsError("detect", expected=f"one of {', '.join(wanted)}", found=found)
+        raise SettingsError("detect", f"one of {', '.join(wanted)}", " and ".join(given) or "none of them")
     recording = filmed_recording(sequence, extent)
     if what.masks is not None:
         _write_masks(output, recording, what.masks, settings, extent)
@@ -251,9 +250,9 @@ def sweep(
         _status(output, status)
         return
     if grid_file is None:
-        raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
+        raise SettingsError("sweep", "GRID.toml or --status DIR", "neither")
     if workers is not None and cluster is None:
-        raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
+        raise SettingsError("--workers", "--cluster local", "no --cluster")
     from psotrack import sweeps
     from psotrack.support import keep_compiled, share_processors, use_device
 

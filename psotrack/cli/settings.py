@@ -55,8 +55,7 @@ class OpenedArchive:
         try:
             settings = self.manifest.track_settings()
         except msgspec.ValidationError as error:
-            expected = "settings of this version of psotrack"
-            raise InputError(self.path, expected=expected, found=f"{error}") from error
+            raise InputError(self.path, "settings of this version of psotrack", f"{error}") from error
         start = self.folder / settings.init
         return settings.changed({"init": f"{start}"}) if start.is_file() else settings
 

@@ -56,7 +56,7 @@ def view(
     from psotrack.show.flights import first_instants, read_flight, split_sequence
 
     if save is not None and web:
-        raise SettingsError("--web", expected="either --save or --web", found="both")
+        raise SettingsError("--web", "either --save or --web", "both")
     check_suffix("--save", save, ".rrd")
     viewer.check_installed()
     if save is not None:
@@ -69,7 +69,7 @@ def view(
     if extent.num_frames is not None:
         flight = first_instants(flight, extent.num_frames)
     if onboard and (flight.recording is None or not flight.recording.onboard):
-        raise SettingsError("--onboard", expected="a recording with cameras on drones", found="none")
+        raise SettingsError("--onboard", "a recording with cameras on drones", "none")
     report, jobs = output.report, extent.jobs
     stored = extent.silhouettes
     content = viewer.ViewContent(

@@ -100,7 +100,7 @@ def track(
     parts = pipeline.Parts()
     if detector is not None:
         if causal:
-            raise SettingsError("--detector", expected="none with --causal", found=detector)
+            raise SettingsError("--detector", "none with --causal", detector)
         network = DetectorSettings(size=detector_size, layout=detector_layout)
         parts["detector"] = find_detector(detector, network)
     keep_compiled(compiled_folder(extent.cache))

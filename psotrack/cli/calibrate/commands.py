@@ -66,7 +66,7 @@ def convert(
     from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_rig
 
     if units is not None and units not in UNITS_M:
-        raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=units)
+        raise SettingsError("--units", f"one of {', '.join(UNITS_M)}", units)
     if lenses:
         rig = read_lenses(source, size, file_format=format)
     else:
@@ -74,9 +74,7 @@ def convert(
         rig = read_rig(source, size, metres_per_unit=metres, file_format=format)
     if distortion is not None:
         if undistorted or lenses:
-            raise SettingsError(
-                "--distortion", expected="neither --undistorted nor --lenses", found="one of them"
-            )
+            raise SettingsError("--distortion", "neither --undistorted nor --lenses", "one of them")
         with errors_name(distortion):
             own = read_lenses(distortion, size).select(rig.names).cameras
         # The focal length stays: it is that with which the coefficients were found.
@@ -87,7 +85,7 @@ def convert(
         # A side is a whole number of pixels.
         if (np.abs(calibrated_wh[:, 1] * size[0] / calibrated_wh[:, 0] - size[1]) >= 1).any():
             expected = f"a size of the shape of {shapes} pixels, as {source.name} states"
-            raise SettingsError("--size", expected=expected, found="{},{}".format(*size))
+            raise SettingsError("--size", expected, "{},{}".format(*size))
         rig = Rig(rig.names, scale_lens(rig.cameras, size))
         output.say(
             f"rescaled from {shapes} to {size[0]} x {size[1]} pixels: both must show the same field of view"

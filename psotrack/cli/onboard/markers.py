@@ -66,7 +66,7 @@ def detect_markers(
         found = list(markers_of_video(open_source(images[0]).first(num_frames), dictionary, output.report))
     else:
         if num_frames is not None:
-            raise SettingsError("--frames", expected="a video", found="images")
+            raise SettingsError("--frames", "a video", "images")
         names, what = _names(photographs), "images"
         found = list(markers_of_images(photographs, dictionary, output.report))
     write_marker_table(out, found, names, force=output.force)
@@ -96,7 +96,7 @@ def _photographs(images: tuple[Path, ...]) -> list[Path] | None:
             inside = image_files(path)
             if not inside:
                 expected = f"images, which end in {', '.join(IMAGE_SUFFIXES)}"
-                raise InputError(path, expected=expected, found="none in this folder")
+                raise InputError(path, expected, "none in this folder")
             paths += inside
         elif is_image(path) or not path.exists():
             paths.append(path)
@@ -105,8 +105,8 @@ def _photographs(images: tuple[Path, ...]) -> list[Path] | None:
         else:
             raise InputError(
                 path,
-                expected="an image or a folder of images",
-                found="another file",
+                "an image or a folder of images",
+                "another file",
                 remedy="a video needs a call of its own",
             )
     return paths
@@ -204,7 +204,7 @@ def map_markers(
     from psotrack.recordings.datasets import write_marker_corners
 
     if out is not None and check is not None:
-        raise SettingsError("onboard map", expected="--out FILE or --check MAP", found="both")
+        raise SettingsError("onboard map", "--out FILE or --check MAP", "both")
     if check is None:
         out = out or Path("aruco_corners.csv")
         check_suffix("--out", out, ".csv")
@@ -213,9 +213,7 @@ def map_markers(
         check_positive("--side", world.side_m)
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
-            raise SettingsError(
-                "SOURCE", expected="one file of measured corners", found=f"{len(sources)} files"
-            )
+            raise SettingsError("SOURCE", "one file of measured corners", f"{len(sources)} files")
         measured = fit_squares(read_measured_corners(sources[0]), side_m=world.side_m)
         write_marker_corners(out, measured.marker_map.corners_m, measured.marker_map.std_m)
         show_measured(output, measured, out)

@@ -33,7 +33,7 @@ def known_corners(
     ids = list(dict.fromkeys(number for number in numbers if number is not None))
     if not numbers or None in numbers:
         expected = "numbers of markers that are known, such as 7 or 7,12"
-        raise SettingsError("--known", expected=expected, found=known or "none")
+        raise SettingsError("--known", expected, known or "none")
     if table is None and side_m is None and is_recording(sources[0]):
         table = find_marker_corners(sources[0])
     if table is not None:
@@ -41,13 +41,11 @@ def known_corners(
         missing = [marker for marker in ids if marker not in marker_map]
         if missing:
             found = f"only {', '.join(map(str, marker_map.ids.tolist()))}"
-            raise InputError(table, expected=f"the known marker {missing[0]}", found=found)
+            raise InputError(table, f"the known marker {missing[0]}", found)
         return {marker: marker_map.corners_m[marker] for marker in ids}
     if side_m is None or len(ids) > 1:
         expected = "--markers with the corners of the known markers, or --side and one known marker"
-        raise SettingsError(
-            "--known", expected=expected, found="no --markers" if side_m is not None else "neither"
-        )
+        raise SettingsError("--known", expected, "no --markers" if side_m is not None else "neither")
     return {ids[0]: corners_in_own_frame(side_m)}
 
 
@@ -78,7 +76,7 @@ class OnboardLensOptions:
         names: tuple[str | None, ...] = self.names or (None,)
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
-            raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
+            raise SettingsError("--camera-name", expected, f"{len(names)}")
         name = names[index % len(names)]
         return choose_lens(size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale)
 
@@ -99,14 +97,14 @@ def videos_of(
 
     if is_recording(sources[0]):
         if len(sources) > 1:
-            raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} sources")
+            raise SettingsError("SOURCE", "one sequence, or videos", f"{len(sources)} sources")
         onboard = onboard_videos(sources[0], drones)
         return {
             name: (one.video, lenses.of(one.video.image_size_wh, index, len(onboard), one.K))
             for index, (name, one) in enumerate(onboard.items())
         }
     if drones is not None:
-        raise SettingsError("--drone", expected="a sequence's folder as SOURCE", found=f"{sources[0]}")
+        raise SettingsError("--drone", "a sequence's folder as SOURCE", f"{sources[0]}")
     rates = [fps or (PICTURES_FPS if is_picture_folder(path) else None) for path in sources]
     infos = [open_video(path, rate) for path, rate in zip(sources, rates, strict=True)]
     return {
@@ -121,11 +119,10 @@ def onboard_videos(folder: Path, names: tuple[str, ...] | None) -> dict[str, Onb
 
     onboard = read_onboard(folder)
     if not onboard:
-        expected = "videos of drones' own cameras, such as dron1_cam_s.avi"
-        raise InputError(folder, expected=expected, found="none")
+        raise InputError(folder, "videos of drones' own cameras, such as dron1_cam_s.avi", "none")
     unknown = [name for name in names or () if name not in onboard]
     if unknown:
-        raise SettingsError("--drone", expected=f"names among {', '.join(onboard)}", found=", ".join(unknown))
+        raise SettingsError("--drone", f"names among {', '.join(onboard)}", ", ".join(unknown))
     return {name: onboard[name] for name in names or onboard}
 
 
@@ -135,5 +132,5 @@ def leading(video: VideoInfo, num_frames: int | None) -> VideoInfo:
         return video
     if not 0 < num_frames <= video.num_frames:
         expected = f"1 to {video.num_frames}, the frames of {video.path}"
-        raise SettingsError("--frames", expected=expected, found=f"{num_frames}")
+        raise SettingsError("--frames", expected, f"{num_frames}")
     return replace(video, num_frames=num_frames)
