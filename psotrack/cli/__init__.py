@@ -1,11 +1,10 @@
 """The command line: every command's help says what the command needs and writes, and shows an example.
 
 In: arguments and files. Out: files, text on stdout, and one line on stderr where something is wrong. Commands contain
-no numerics. A command's module is imported when the command runs, and the module imports the functions that it calls
-when they are called, so that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2
-for every error, and 1 if `doctor` or `onboard map --check` finds a fault. No other room uses this room;
-`psotrack.__main__`, which the installed script and `python -m psotrack` run, calls `main` and answers Ctrl-C and
-SIGTERM (`psotrack.support.interrupts`).
+no numerics. A command's module is imported when the command runs, and rooms load what is called when it is called, so
+that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2 for every error, and 1 if
+`doctor` or `onboard map --check` finds a fault. No other room uses this room; `psotrack.__main__`, which the installed
+script and `python -m psotrack` run, calls `main` and answers Ctrl-C and SIGTERM (`psotrack.support.interrupts`).
 """
 
 from __future__ import annotations

@@ -16,13 +16,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import click
 from msgspec import Meta
 
+from psotrack import pipeline, recordings, support, trajectories
 from psotrack.cli.commands import command
 from psotrack.cli.options import Cache, Cameras, MostDrones, Seq, compiled_folder, recording_named
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.settings import TrackingSettings
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
+from psotrack.recordings import datasets
 from psotrack.settings import TrackSettings
+from psotrack.show import viewer
 from psotrack.support import write_json
 from psotrack.support.interrupts import unhurried_end
 
@@ -30,8 +33,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from psotrack.live import LiveResult, LiveSession
-    from psotrack.recordings import Recording
-    from psotrack.show.viewer import LiveView
 
 #: Time between two changes of the table on the terminal, seconds.
 _SHOWN_S = 0.5
@@ -98,10 +99,6 @@ def live(
     from rich.live import Live
 
     from psotrack import live as filming
-    from psotrack.pipeline import warn_of_missing_drones, with_real_time
-    from psotrack.recordings.datasets import open_recording
-    from psotrack.support import keep_compiled
-    from psotrack.trajectories import RowStream
 
     if not (out or lines or udp or websocket or view):
         raise SettingsError("--out", "--out FILE, --lines, --udp, --websocket or --view", "none of them")
@@ -111,9 +108,9 @@ def live(
     if view is not None:
         _check_viewer(view)
     tracking = TrackSettings().changed(settings)
-    keep_compiled(compiled_folder(cache))
+    support.keep_compiled(compiled_folder(cache))
     start_s = output.elapsed_s
-    recording = open_recording(sequence)
+    recording = datasets.open_recording(sequence)
     if replay:
         recording = recording.usable(cameras)
     used = filming.live_cameras(recording, cameras, replay=replay, speed=speed, loops=loops)
@@ -135,7 +132,9 @@ def live(
             stack.enter_context(filming.recording_folder(record, recording, names, force=output.force))
         outputs: list[filming.RowsOutput] = []
         if out is not None:
-            rows = stack.enter_context(RowStream(out, force=output.force, record=out.with_suffix(".json")))
+            rows = stack.enter_context(
+                trajectories.RowStream(out, force=output.force, record=out.with_suffix(".json"))
+            )
             outputs.append(rows.write)
         if lines:
             outputs.append(partial(filming.write_lines, sys.stdout))
@@ -166,13 +165,13 @@ def live(
                 table.update(_table(result), refresh=True)
 
         result = session.run(outputs, show, longest_s=seconds or float("inf"))
-    warn_of_missing_drones(tracking, len(result.drones))
+    pipeline.warn_of_missing_drones(tracking, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients}
     if out is not None:
         report["recording"] = recording_named(sequence, out)
-    report = with_real_time(report, output.elapsed_s, start_s=start_s)
+    report = pipeline.with_real_time(report, output.elapsed_s, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)
     output.json(report)
@@ -187,18 +186,14 @@ def live(
 
 
 def _check_viewer(view: str) -> None:
-    from psotrack.show.viewer import check_display, check_installed
-
-    check_installed()
+    viewer.check_installed()
     if view == "window":
-        check_display()
+        viewer.check_display()
 
 
 @contextlib.contextmanager
-def _open_view(chosen: str, recording: Recording, quiet: bool) -> Iterator[LiveView]:
-    from psotrack.show.viewer import LiveView
-
-    with LiveView(recording, web=chosen == "web") as view:
+def _open_view(chosen: str, recording: recordings.Recording, quiet: bool) -> Iterator[viewer.LiveView]:
+    with viewer.LiveView(recording, web=chosen == "web") as view:
         if view.page:
             click.echo(view.page, err=quiet)
         yield view

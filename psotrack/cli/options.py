@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import click
 from msgspec import Meta
 
+from psotrack import recordings
 from psotrack.cli.output import Output
 from psotrack.cli.types import RUNNING, SequencePath, says
 from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import datasets
 from psotrack.settings import BLOBS, YOLO
+from psotrack.show import flights
 from psotrack.support import user_cache
-
-if TYPE_CHECKING:
-    from psotrack.recordings import Recording
 
 #: Side of a detector network's square input, pixels: the size that YOLO networks are trained with.
 DETECTOR_SIZE = 640
@@ -107,18 +107,17 @@ class Extent:
         return cache_folder(self.cache)
 
 
-def filmed_recording(source: Path, extent: Extent) -> Recording:
+def filmed_recording(source: Path, extent: Extent) -> recordings.Recording:
     """The videos of a recording, calibrated or not, or a single video, or a folder of pictures as a recording."""
-    from psotrack.recordings import is_picture_folder, open_video, recording_of_video, with_all_videos
-    from psotrack.recordings.datasets import is_recording, open_recording
-
     if not source.exists():
         raise InputError(source, "a video, a folder of pictures, or a recording", "no such file or folder")
-    if not is_recording(source) and (source.is_file() or is_picture_folder(source)):
+    if not datasets.is_recording(source) and (source.is_file() or recordings.is_picture_folder(source)):
         # Nothing that is made from the pictures depends on their rate.
-        recording = recording_of_video(open_video(source, 1.0 if is_picture_folder(source) else None))
+        recording = recordings.recording_of_video(
+            recordings.open_video(source, 1.0 if recordings.is_picture_folder(source) else None)
+        )
     else:
-        recording = with_all_videos(open_recording(source))
+        recording = recordings.with_all_videos(datasets.open_recording(source))
     return recording.usable(extent.cameras, extent.num_frames)
 
 
@@ -142,7 +141,7 @@ def beside(sequence: Path, name: str) -> Path:
     return (sequence if sequence.is_dir() else sequence.parent) / "results" / name
 
 
-def detections_of(output: Output, recording: Recording) -> str:
+def detections_of(output: Output, recording: recordings.Recording) -> str:
     """Default of `--detections`: the recording's own, or the blobs of its silhouettes where there are none."""
     if recording.detections:
         return YOLO
@@ -156,9 +155,7 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
     Raises:
         InputError: no record beside the tracks names a recording that is there.
     """
-    from psotrack.show.flights import find_recording
-
-    found = given or find_recording(tracks)
+    found = given or flights.find_recording(tracks)
     if found is None:
         raise InputError(
             tracks, "a record beside the tracks that names their recording", "none", remedy="name SEQ"
@@ -169,6 +166,9 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
 def recording_named(sequence: Path, tracks: Path) -> str:
     """How the record beside tracks names their recording; empty for an archive, whose content is gone afterwards."""
     from psotrack.cli.settings import archive_of
-    from psotrack.show.flights import recording_beside
 
-    return "" if archive_of(click.get_current_context()) is not None else recording_beside(sequence, tracks)
+    return (
+        ""
+        if archive_of(click.get_current_context()) is not None
+        else flights.recording_beside(sequence, tracks)
+    )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_che
 
 import click
 
-from psotrack import __version__
+from psotrack import __version__, trajectories
 from psotrack.cli.types import says
 from psotrack.errors import OutputError, PsotrackError, SettingsError, system_errors
 from psotrack.support import (
@@ -34,8 +34,6 @@ from psotrack.support import (
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from psotrack.trajectories import Trajectories
 
 
 #: Sentences that a command prints, and stages of its progress, for the log only: they do not pass to other handlers.
@@ -239,18 +237,16 @@ class Output:
         self.json(result.to_dict())
         self.say(*f"{result}".splitlines())
 
-    def drones(self, tracks: Trajectories, size_m: np.ndarray | None = None) -> None:
+    def drones(self, tracks: trajectories.Trajectories, size_m: np.ndarray | None = None) -> None:
         """Print a table of the drones, at most 80 characters wide.
 
         Args:
             tracks: the tracks of the drones.
             size_m: (drones, 3), learned sizes, metres; None where they are not known.
         """
-        from psotrack.trajectories import summary_columns
-
         if not self.shows:
             return
-        columns = summary_columns(tracks, size_m)
+        columns = trajectories.summary_columns(tracks, size_m)
         # These two would make the table wider than 80 characters; notebooks show them.
         for heading in ("extent (m)", "speed (m/s)"):
             columns.pop(heading, None)

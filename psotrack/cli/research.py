@@ -13,6 +13,7 @@ import click
 from msgspec import Meta
 from msgspec.structs import replace
 
+from psotrack import recordings, support, sweeps
 from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import (
     Cache,
@@ -28,13 +29,13 @@ from psotrack.cli.output import Output
 from psotrack.cli.settings import TrackingSettings
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
+from psotrack.foreground import detection
 from psotrack.foreground.detection import DetectorSettings
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.settings import TrackSettings
 
 if TYPE_CHECKING:
     from psotrack.foreground.silhouettes import CacheEntry
-    from psotrack.recordings import Recording
 
 
 logger = logging.getLogger(__name__)
@@ -118,17 +119,16 @@ def _silhouettes(settings: dict[str, Any]) -> SilhouetteSettings:
     return TrackSettings().changed(settings).silhouettes
 
 
-def _write(output: Output, sequence: Path, recording: Recording, out: Path | None, found: Any) -> None:
+def _write(
+    output: Output, sequence: Path, recording: recordings.Recording, out: Path | None, found: Any
+) -> None:
     """Write the boxes of each camera as they are found."""
-    from psotrack.recordings import write_detections
-    from psotrack.support import check_file_name
-
     out = out or beside(sequence, "detections")
-    files = {name: out / f"{check_file_name(name, sequence)}.csv" for name in recording.videos}
+    files = {name: out / f"{support.check_file_name(name, sequence)}.csv" for name in recording.videos}
     output.refuse(*files.values())
     counts: dict[str, int] = {}
     for name, detections in found:
-        write_detections(files[name], detections)
+        recordings.write_detections(files[name], detections)
         counts[name] = len(detections)
     if not any(counts.values()):
         logger.warning(
@@ -142,16 +142,18 @@ def _write(output: Output, sequence: Path, recording: Recording, out: Path | Non
     )
 
 
-def _by_network(output: Output, recording: Recording, chosen: str, network: DetectorSettings) -> Any:
+def _by_network(
+    output: Output, recording: recordings.Recording, chosen: str, network: DetectorSettings
+) -> Any:
     """Detections of each camera by a network, one camera after the other."""
-    from psotrack.foreground.detection import detect_drones, find_detector
-
-    detector = find_detector(chosen, network)
+    detector = detection.find_detector(chosen, network)
     for name, video in recording.videos.items():
-        yield name, detect_drones(detector, name, video, report=output.report)
+        yield name, detection.detect_drones(detector, name, video, report=output.report)
 
 
-def _by_blobs(output: Output, recording: Recording, settings: SilhouetteSettings, extent: Extent) -> Any:
+def _by_blobs(
+    output: Output, recording: recordings.Recording, settings: SilhouetteSettings, extent: Extent
+) -> Any:
     """Detections of each camera by the blobs of its silhouettes."""
     import numpy as np
 
@@ -167,7 +169,9 @@ def _by_blobs(output: Output, recording: Recording, settings: SilhouetteSettings
     yield from blob_detections(made, sizes, output.report).items()
 
 
-def _store(output: Output, recording: Recording, settings: SilhouetteSettings, extent: Extent) -> None:
+def _store(
+    output: Output, recording: recordings.Recording, settings: SilhouetteSettings, extent: Extent
+) -> None:
     """Compute and store silhouettes."""
     from psotrack.foreground.silhouettes import compute
 
@@ -187,7 +191,7 @@ def _store(output: Output, recording: Recording, settings: SilhouetteSettings, e
 
 
 def _write_masks(
-    output: Output, recording: Recording, out: Path, settings: dict[str, Any], extent: Extent
+    output: Output, recording: recordings.Recording, out: Path, settings: dict[str, Any], extent: Extent
 ) -> None:
     """Write the masks of all cameras, whose stored size plays no part."""
     from psotrack.foreground.silhouettes import write_masks
@@ -254,7 +258,6 @@ def sweep(
     if workers is not None and cluster is None:
         raise SettingsError("--workers", "--cluster local", "no --cluster")
     from psotrack import sweeps
-    from psotrack.support import keep_compiled, share_processors, use_device
 
     def say(address: str) -> None:
         if not output.quiet:
@@ -268,12 +271,12 @@ def sweep(
         output.result(sweeps.plan(grid, inputs, sweeps.Store(out)))
         return
     if cluster is not None:
-        use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
+        support.use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
     else:
-        share_processors()
+        support.share_processors()
         if device is not None:
-            use_device(device)
-        keep_compiled(compiled_folder(cache))
+            support.use_device(device)
+        support.keep_compiled(compiled_folder(cache))
     at = None if cluster is None else sweeps.Cluster(cluster, workers, device, say)
     outcome = sweeps.sweep(grid, out, data=data, cache=cache, jobs=jobs, cluster=at, progress=output.report)
     output.result(outcome)
@@ -283,9 +286,7 @@ def sweep(
 
 def _status(output: Output, folder: Path) -> None:
     """Print the numbers of finished, failed and locked cells in a folder, and the processes at work."""
-    from psotrack.sweeps import Store
-
-    content = Store(folder).status()
+    content = sweeps.Store(folder).status()
     output.json(content)
     for failure in content["errors"]:
         output.say(f"failed: {failure}")

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import click
 
+from psotrack import support
+from psotrack.calibration import clocks
 from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import Bodies, Cache, Plot, SeqOfTracks, cache_folder, sequence_of
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import Words, says
 from psotrack.errors import OutputError, SettingsError, errors_name
 from psotrack.evaluation import PathSettings
+from psotrack.pipeline import archives
+from psotrack.recordings import datasets, exchange
 from psotrack.support import ARCHIVE_SUFFIX, first_line
 
 if TYPE_CHECKING:
@@ -81,21 +85,20 @@ def evaluate(
         orientations: orientations of the reference by a clock of their own, as of an IMU, as TUM.
     """
     from psotrack import evaluation
-    from psotrack.calibration.clocks import own_reference, reference_for
     from psotrack.evaluation import plots, tables
-    from psotrack.recordings.datasets import open_recording
-    from psotrack.recordings.exchange import read_tracks
 
     sequence = sequence_of(tracks, sequence)
     picture = None if plot is None else plot if plot.name else tracks.with_suffix(".png")
     output.refuse(picture)
     is_poses = sequence.is_file() and sequence.suffix.lower() not in (".toml", ".c3d")
     if is_poses or drone is not None or orientations is not None or _is_camera_path(tracks):
-        path = evaluation.drone_of(read_tracks(tracks), drone)
+        path = evaluation.drone_of(exchange.read_tracks(tracks), drone)
         reference = (
-            read_tracks(sequence) if is_poses else own_reference(open_recording(sequence, bodies=bodies))
+            exchange.read_tracks(sequence)
+            if is_poses
+            else clocks.own_reference(datasets.open_recording(sequence, bodies=bodies))
         )
-        turns = None if orientations is None else evaluation.drone_of(read_tracks(orientations))
+        turns = None if orientations is None else evaluation.drone_of(exchange.read_tracks(orientations))
         with errors_name(f"{tracks} and {sequence}"):
             body = evaluation.drone_of(reference, drone or path.drones[0])
             offset_s = None if offset == "auto" else offset
@@ -106,10 +109,10 @@ def evaluate(
             plots.save_paths(picture, {tracks.stem: compared}, force=output.force)
             output.say(f"{picture}: paths, and errors over time")
         return
-    recording = open_recording(sequence, bodies=bodies)
-    estimate = read_tracks(tracks, recording=recording)
+    recording = datasets.open_recording(sequence, bodies=bodies)
+    estimate = exchange.read_tracks(tracks, recording=recording)
     with errors_name(f"{tracks} and {sequence}"):
-        truth, by_s = reference_for(recording, estimate, offset)
+        truth, by_s = clocks.reference_for(recording, estimate, offset)
         found = evaluation.evaluate(estimate, truth)
     output.json(found.to_dict() | ({} if offset is None else {"reference_offset_s": by_s}))
     clock = "" if offset is None else f", reference's clock {by_s:+.4f} s"
@@ -160,19 +163,18 @@ def export(
         drone_size_m: full lengths of a drone along x, y and z, in metres, for boxes of --to mot. None: those that the
             record beside TRACKS has.
     """
-    from psotrack.recordings.datasets import open_recording
-    from psotrack.recordings.exchange import Footage, export_tracks, read_tracks
-
     out = out or tracks.with_name(f"{tracks.stem}_{to}{_SUFFIXES.get(to, '')}")
     _check_options(tracks, sequence, to, out, images)
-    recording = None if sequence is None else open_recording(sequence)
-    trajectories = read_tracks(tracks, recording=recording)
+    recording = None if sequence is None else datasets.open_recording(sequence)
+    trajectories = exchange.read_tracks(tracks, recording=recording)
     footage = None
     if recording is not None:
         sizes_m = _sizes_m(trajectories, tracks, drone_size_m) if to == "mot" else None
-        footage = Footage(recording, sizes_m, images)
+        footage = exchange.Footage(recording, sizes_m, images)
     with errors_name(tracks):
-        lost = export_tracks(trajectories, to, out, footage=footage, force=output.force, report=output.report)
+        lost = exchange.export_tracks(
+            trajectories, to, out, footage=footage, force=output.force, report=output.report
+        )
     left = f"; not in this format: {', '.join(lost)}" if lost else ""
     drones = f"{trajectories.num_drones} drone{'s' if trajectories.num_drones != 1 else ''}"
     output.say(f"{out}: {to}, {drones}, {trajectories.num_frames} frames{left}")
@@ -215,11 +217,9 @@ def _sizes_m(
 
 def _recorded_sizes(record: Path) -> dict[str, list[float]]:
     """Sizes by the drones' names, from the record of a run; empty where there is no record that has them."""
-    from psotrack.support import read_json
-
     if not record.exists():
         return {}
-    drones = read_json(record, "the record of the tracks beside it").get("drones")
+    drones = support.read_json(record, "the record of the tracks beside it").get("drones")
     # `track --causal` records the number of drones alone.
     listed = drones if isinstance(drones, list) else []
     return {str(each["drone"]): each["size_m"] for each in listed if each.get("size_m") and "drone" in each}
@@ -254,21 +254,18 @@ def archive(
             the same name.
         videos: pack the videos, too. None: a digest of each video.
     """
-    from psotrack.pipeline.archives import pack_tracks, unpack
-    from psotrack.recordings.datasets import open_recording
-
     if tracks.suffix == ARCHIVE_SUFFIX and not tracks.is_dir():
         if sequence is not None or videos:
             found = f"{sequence}" if sequence is not None else "--videos"
             raise SettingsError("archive", "nothing else with an archive to unpack", found)
         out = out or tracks.with_suffix("")
-        manifest = unpack(tracks, out, force=output.force, report=output.report)
+        manifest = archives.unpack(tracks, out, force=output.force, report=output.report)
         output.say(f"{out}: {manifest.sequence}, {len(manifest.files)} files, {manifest.tracks}")
         return
     out = out or tracks.with_suffix(ARCHIVE_SUFFIX)
     check_suffix("--out", out, ARCHIVE_SUFFIX)
-    recording = open_recording(sequence_of(tracks, sequence))
-    manifest = pack_tracks(
+    recording = datasets.open_recording(sequence_of(tracks, sequence))
+    manifest = archives.pack_tracks(
         tracks,
         recording,
         out,

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import click
 import msgspec
@@ -20,12 +20,9 @@ from psotrack.cli.commands import Field, OptionGroup, fields_of, is_given, optio
 from psotrack.cli.output import check_suffix
 from psotrack.cli.types import says
 from psotrack.errors import InputError, SettingsError
+from psotrack.pipeline import archives
 from psotrack.settings import TrackSettings, flatten
 from psotrack.support import atomic_write, read_toml, refuse_files, toml_value
-
-if TYPE_CHECKING:
-    from psotrack.pipeline.archives import Manifest
-
 
 #: Key of the archive in the context of a command.
 _ARCHIVE = "psotrack.archive"
@@ -43,7 +40,7 @@ class OpenedArchive:
 
     path: Path
     folder: Path
-    manifest: Manifest
+    manifest: archives.Manifest
 
     @property
     def settings(self) -> TrackSettings:
@@ -73,14 +70,12 @@ def opened_archive(context: click.Context, path: Path) -> Path:
     Raises:
         InputError: the archive does not exist, was cut short or changed, or is of a newer version.
     """
-    from psotrack.pipeline.archives import read_manifest, unpack
-
     temporary = Path(context.with_resource(tempfile.TemporaryDirectory(prefix="psotrack-")))
-    manifest = unpack(path, temporary / "archive")
+    manifest = archives.unpack(path, temporary / "archive")
     # `unpack` refuses names that lead elsewhere, but this name is no path of the archive.
     name = Path(manifest.sequence).name or "archive"
     folder = (temporary / "archive").rename(temporary / name)
-    context.meta[_ARCHIVE] = OpenedArchive(path, folder, read_manifest(folder))
+    context.meta[_ARCHIVE] = OpenedArchive(path, folder, archives.read_manifest(folder))
     return folder
 
 
@@ -120,10 +115,9 @@ def with_comparison(
     archive = archive_of(click.get_current_context())
     if archive is None:
         return record, ""
-    from psotrack.pipeline.archives import compare_with_archive
 
     asked = archive.without_place(settings)
-    comparison = compare_with_archive(archive.folder, archive.manifest, tracks, record, asked)
+    comparison = archives.compare_with_archive(archive.folder, archive.manifest, tracks, record, asked)
     of_archive = {"file": archive.path.name, **comparison.to_dict()}
     return {**record, "archive": of_archive}, f"; {comparison.sentence(archive.path.name)}"
 

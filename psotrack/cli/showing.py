@@ -11,11 +11,13 @@ from typing import Annotated, Literal
 import click
 from msgspec import Meta
 
+from psotrack import sweeps
 from psotrack.cli.commands import command
 from psotrack.cli.options import Dictionary, Extent, Jobs, SeqOfTracks, sequence_of
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import opened_sequence, says
 from psotrack.errors import SettingsError, errors_name
+from psotrack.show import flights
 from psotrack.support import ARCHIVE_SUFFIX
 
 
@@ -53,7 +55,6 @@ def view(
         onboard: show the cameras on drones too, with the markers that they see.
     """
     from psotrack.show import viewer
-    from psotrack.show.flights import first_instants, read_flight, split_sequence
 
     if save is not None and web:
         raise SettingsError("--web", "either --save or --web", "both")
@@ -64,10 +65,12 @@ def view(
     elif not web:
         viewer.check_display()
     archive = tracks[-1].suffix == ARCHIVE_SUFFIX
-    files, sequence = split_sequence((*tracks[:-1], opened_sequence(tracks[-1])) if archive else tracks)
-    flight = read_flight(files, sequence, cameras=extent.cameras)
+    files, sequence = flights.split_sequence(
+        (*tracks[:-1], opened_sequence(tracks[-1])) if archive else tracks
+    )
+    flight = flights.read_flight(files, sequence, cameras=extent.cameras)
     if extent.num_frames is not None:
-        flight = first_instants(flight, extent.num_frames)
+        flight = flights.first_instants(flight, extent.num_frames)
     if onboard and (flight.recording is None or not flight.recording.onboard):
         raise SettingsError("--onboard", "a recording with cameras on drones", "none")
     report, jobs = output.report, extent.jobs
@@ -167,15 +170,15 @@ def report(
 
 def _table(folder: Path, layout: str, rows: str, columns: str | None, value: str, scale: float) -> str:
     """A table of the results of a sweep."""
-    from psotrack.sweeps import Store, pivot, render_table
-
     rows_by = [name for name in rows.split(",") if name]
     if columns is None:
         columns = next((name for name in ("method", "sequence") if name not in rows_by), "")
     columns_by = [name for name in columns.split(",") if name]
     with errors_name(folder):
-        shown = pivot(Store(folder).rows(), rows_by=rows_by, columns_by=columns_by, value=value, scale=scale)
-    return render_table(shown, layout).rstrip("\n")
+        shown = sweeps.pivot(
+            sweeps.Store(folder).rows(), rows_by=rows_by, columns_by=columns_by, value=value, scale=scale
+        )
+    return sweeps.render_table(shown, layout).rstrip("\n")
 
 
 @command(without=["json_path"])

@@ -8,19 +8,19 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import click
 from msgspec import Meta
 
+from psotrack import geometry, pipeline, recordings, simulation, support
 from psotrack.cli.commands import command
 from psotrack.cli.options import Bodies, Jobs, compiled_folder
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import SequencePath, Words, says
-
-if TYPE_CHECKING:
-    from psotrack.recordings.datasets import DraftOptions, Matching
-
+from psotrack.foreground import silhouettes
+from psotrack.recordings import datasets
+from psotrack.show import flights, overlay
 
 #: Width of the table in a file or a pipe, characters.
 _WIDE = 200
@@ -81,19 +81,16 @@ def init(
         out: file to write. None: FOLDER/recording.toml.
         show: show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.
     """
-    from psotrack.recordings import RECORDING_FILE
-    from psotrack.recordings.datasets import DraftOptions, draft_recording
-
     if show:
         _show(output, folder, bodies)
         return
-    out = out or folder / RECORDING_FILE
+    out = out or folder / recordings.RECORDING_FILE
     check_suffix("--out", out, ".toml")
     output.refuse(out)
-    options = DraftOptions(
+    options = datasets.DraftOptions(
         calibration, unit=unit, match=match, leave_out=leave_out, fps=fps, size_wh=size_wh, bodies=bodies
     )
-    draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
+    draft = datasets.draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
     for each in draft.recording.cameras:
         each.check_size()
     older = draft.write()
@@ -105,9 +102,7 @@ def init(
 
 def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
     """Show a recording, and check its files."""
-    from psotrack.recordings.datasets import open_recording
-
-    recording = open_recording(sequence, bodies=bodies)
+    recording = datasets.open_recording(sequence, bodies=bodies)
     for each in recording.cameras:
         each.check_size()
     recording.check_detections(recording.detections)
@@ -119,14 +114,12 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
 
 
 def _say_inventory(output: Output, content: dict[str, Any]) -> None:
-    from psotrack.recordings import inventory
-
     output.json(content)
-    title, headings, rows = inventory(content)
+    title, headings, rows = recordings.inventory(content)
     output.table(headings, rows, title, least_width=_WIDE)
 
 
-def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
+def asked(folder: Path, out: Path, options: datasets.DraftOptions) -> datasets.DraftOptions:
     """The options with what the user answers of the files whose names do not say whose they are.
 
     Raises:
@@ -134,9 +127,7 @@ def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
     """
     from dataclasses import replace
 
-    from psotrack.recordings.datasets import match_files
-
-    matching = match_files(folder, out, options)
+    matching = datasets.match_files(folder, out, options)
     questions = matching.questions()
     if not questions:
         return options
@@ -161,10 +152,8 @@ def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
     return replace(options, match=matched, leave_out=left_out)
 
 
-def _answer(question: str, matching: Matching, numbers: dict[str, str]) -> str:
+def _answer(question: str, matching: datasets.Matching, numbers: dict[str, str]) -> str:
     """The camera of a file, or "-"."""
-    from psotrack.geometry import chosen_camera
-
     while True:
         try:
             answer = input(question).strip()
@@ -172,7 +161,7 @@ def _answer(question: str, matching: Matching, numbers: dict[str, str]) -> str:
             answer = ""
         if not answer:
             raise matching.error()
-        camera = numbers.get(answer) or chosen_camera(answer, matching.cameras)
+        camera = numbers.get(answer) or geometry.chosen_camera(answer, matching.cameras)
         if answer == "-" or camera is not None:
             return camera or answer
         if matching.calibration is None:
@@ -233,33 +222,28 @@ def demo(output: Output, *, out: Path = Path("psotrack-demo"), seed: int = 0, jo
         seed: seed of flights, noise and swarm.
     """
     from psotrack.evaluation import evaluate, tables
-    from psotrack.foreground.silhouettes import SilhouetteSettings
-    from psotrack.pipeline import track_recording, with_real_time
-    from psotrack.recordings.datasets import read_sequence
     from psotrack.settings import TrackSettings
-    from psotrack.show.flights import flight_of, record_files, write_tracked
-    from psotrack.show.overlay import save_picture
-    from psotrack.simulation import SimulationSettings, simulate
-    from psotrack.support import atomic_write, keep_compiled
 
-    keep_compiled(compiled_folder(None))
+    support.keep_compiled(compiled_folder(None))
     tracks, picture, force = out / "tracks.csv", out / "demo.png", output.force
-    output.refuse(tracks, *record_files(tracks), picture)
+    output.refuse(tracks, *flights.record_files(tracks), picture)
     made: dict[str, Any] = {"jobs": jobs, "report": output.report}
-    simulated = SimulationSettings(NUM_FRAMES, SCALE, seed, masks=False, onboard=False)
-    folder = simulate(NAME, out, simulated, force=force, keep=not force, **made)
+    simulated = simulation.SimulationSettings(NUM_FRAMES, SCALE, seed, masks=False, onboard=False)
+    folder = simulation.simulate(NAME, out, simulated, force=force, keep=not force, **made)
     began_s = time.perf_counter()
-    recording = read_sequence(folder).usable()
+    recording = datasets.read_sequence(folder).usable()
     # Half the image size needs half the reduction, so that drones have the same number of silhouette pixels.
-    settings = TrackSettings(seed=seed, silhouettes=SilhouetteSettings(reduction=2, working_reduction=1))
-    tracked = track_recording(recording, settings, cache=out / "silhouettes", **made)
-    record = with_real_time(tracked.record, time.perf_counter() - began_s)
+    settings = TrackSettings(
+        seed=seed, silhouettes=silhouettes.SilhouetteSettings(reduction=2, working_reduction=1)
+    )
+    tracked = pipeline.track_recording(recording, settings, cache=out / "silhouettes", **made)
+    record = pipeline.with_real_time(tracked.record, time.perf_counter() - began_s)
     tracked = replace(tracked, record=record)
     assert recording.truth is not None, "the simulator writes one"
     errors = evaluate(tracked.trajectories, recording.truth)
-    with atomic_write(picture) as picture_file:
-        save_picture(picture_file, flight_of(tracked, recording))
-        write_tracked(tracks, tracked, folder, force=force)
+    with support.atomic_write(picture) as picture_file:
+        overlay.save_picture(picture_file, flights.flight_of(tracked, recording))
+        flights.write_tracked(tracks, tracked, folder, force=force)
     output.say(*tables.as_text(errors, recording.name).splitlines())
     output.say(f"picture: {picture}")
     # A command of an environment that is not activated is typed with its path.
@@ -296,14 +280,11 @@ def run(
         again: do all steps again, also those that are done.
     """
     from psotrack import api
-    from psotrack.recordings import RECORDING_FILE
-    from psotrack.recordings.datasets import DraftOptions, videos_in
-    from psotrack.support import keep_compiled
 
-    files = DraftOptions()
-    if output.can_ask and videos_in(folder) and not (folder / RECORDING_FILE).exists():
-        files = asked(folder, folder / RECORDING_FILE, files)
-    keep_compiled(compiled_folder(None))
+    files = datasets.DraftOptions()
+    if output.can_ask and datasets.videos_in(folder) and not (folder / recordings.RECORDING_FILE).exists():
+        files = asked(folder, folder / recordings.RECORDING_FILE, files)
+    support.keep_compiled(compiled_folder(None))
     summary = api.run(
         folder,
         square_m=square_m,

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from psotrack import support, trajectories
 from psotrack.cli.commands import command
 from psotrack.cli.options import (
     DETECTOR_SIZE,
@@ -22,7 +23,10 @@ from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.settings import TrackingSettings, chosen_extent, chosen_settings, with_comparison
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
+from psotrack.foreground import detection
 from psotrack.foreground.detection import Layout
+from psotrack.recordings import datasets
+from psotrack.show import flights
 from psotrack.support import write_json
 
 
@@ -84,11 +88,6 @@ def track(
         most_drones: largest number of drones at one time with --causal.
     """
     from psotrack import pipeline
-    from psotrack.foreground.detection import DetectorSettings, find_detector
-    from psotrack.recordings.datasets import open_recording
-    from psotrack.show.flights import write_tracked
-    from psotrack.support import keep_compiled
-    from psotrack.trajectories import RowStream, read_trajectories
 
     out = out or beside(sequence, "tracks.csv")
     # Rows that come one by one are those of a CSV file.
@@ -101,11 +100,11 @@ def track(
     if detector is not None:
         if causal:
             raise SettingsError("--detector", "none with --causal", detector)
-        network = DetectorSettings(size=detector_size, layout=detector_layout)
-        parts["detector"] = find_detector(detector, network)
-    keep_compiled(compiled_folder(extent.cache))
+        network = detection.DetectorSettings(size=detector_size, layout=detector_layout)
+        parts["detector"] = detection.find_detector(detector, network)
+    support.keep_compiled(compiled_folder(extent.cache))
     start_s = output.elapsed_s
-    opened = open_recording(sequence)
+    opened = datasets.open_recording(sequence)
     if detector is None:
         if chosen.reads_detections and "detections" not in settings:
             chosen = chosen.changed({"detections": detections_of(output, opened)})
@@ -121,18 +120,18 @@ def track(
 
     if causal:
         frames, record = pipeline.track_causally(recording, chosen, most_drones=most_drones, **made)
-        with RowStream(out, force=output.force, record=record_path) as rows:
+        with trajectories.RowStream(out, force=output.force, record=record_path) as rows:
             for frame in frames:
                 rows.write(frame)
         record, sentence = with_comparison(recorded(record), out, chosen)
         write_json(record_path, record)
         size_m, seen = None, f"{record['drones']} drones, {record['frames']} frames"
         # A file without rows is none of tracks.
-        tracks = read_trajectories(out) if record["drones"] and output.shows else None
+        tracks = trajectories.read_trajectories(out) if record["drones"] and output.shows else None
     else:
         tracked = pipeline.track_recording(recording, chosen, **made, **parts)
         tracked = replace(tracked, record=recorded(tracked.record))
-        write_tracked(out, tracked, force=output.force)
+        flights.write_tracked(out, tracked, force=output.force)
         record, sentence = with_comparison(dict(tracked.record), out, chosen)
         if sentence:
             write_json(record_path, record)

@@ -5,18 +5,19 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+from psotrack import geometry
+from psotrack.calibration import clocks
 from psotrack.calibration.rig.settings import BoardSettings, LensSettings, PointSettings, WorldSettings
 from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import Bodies, Cache, Jobs, Plot, Seq, cache_folder, detections_of
 from psotrack.cli.output import Output
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError, errors_name
+from psotrack.geometry import rig_files
+from psotrack.recordings import datasets, exchange
 from psotrack.support import POSITION, format_numbers
-
-if TYPE_CHECKING:
-    from psotrack.geometry import Rig
 
 
 @command(without=["progress"])
@@ -62,23 +63,20 @@ def convert(
     """
     import numpy as np
 
-    from psotrack.geometry import Rig, scale_lens
-    from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_rig
-
-    if units is not None and units not in UNITS_M:
-        raise SettingsError("--units", f"one of {', '.join(UNITS_M)}", units)
+    if units is not None and units not in rig_files.UNITS_M:
+        raise SettingsError("--units", f"one of {', '.join(rig_files.UNITS_M)}", units)
     if lenses:
-        rig = read_lenses(source, size, file_format=format)
+        rig = rig_files.read_lenses(source, size, file_format=format)
     else:
-        metres = None if units is None else UNITS_M[units]
-        rig = read_rig(source, size, metres_per_unit=metres, file_format=format)
+        metres = None if units is None else rig_files.UNITS_M[units]
+        rig = rig_files.read_rig(source, size, metres_per_unit=metres, file_format=format)
     if distortion is not None:
         if undistorted or lenses:
             raise SettingsError("--distortion", "neither --undistorted nor --lenses", "one of them")
         with errors_name(distortion):
-            own = read_lenses(distortion, size).select(rig.names).cameras
+            own = rig_files.read_lenses(distortion, size).select(rig.names).cameras
         # The focal length stays: it is that with which the coefficients were found.
-        rig = Rig(rig.names, replace(rig.cameras, dist=own.dist, fisheye=own.fisheye))
+        rig = geometry.Rig(rig.names, replace(rig.cameras, dist=own.dist, fisheye=own.fisheye))
     calibrated_wh = np.unique(rig.cameras.image_size_wh, axis=0)
     if size is not None and (calibrated_wh != size).any():
         shapes = " and ".join(f"{width:.0f} x {height:.0f}" for width, height in calibrated_wh)
@@ -86,17 +84,17 @@ def convert(
         if (np.abs(calibrated_wh[:, 1] * size[0] / calibrated_wh[:, 0] - size[1]) >= 1).any():
             expected = f"a size of the shape of {shapes} pixels, as {source.name} states"
             raise SettingsError("--size", expected, "{},{}".format(*size))
-        rig = Rig(rig.names, scale_lens(rig.cameras, size))
+        rig = geometry.Rig(rig.names, geometry.scale_lens(rig.cameras, size))
         output.say(
             f"rescaled from {shapes} to {size[0]} x {size[1]} pixels: both must show the same field of view"
         )
     if undistorted:
-        rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
-    write_rig(out, rig, force=output.force, file_format=to, placed=not lenses)
+        rig = geometry.Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
+    rig_files.write_rig(out, rig, force=output.force, file_format=to, placed=not lenses)
     _show(output, rig, out, placed=not lenses)
 
 
-def _show(output: Output, rig: Rig, out: Path, *, placed: bool) -> None:
+def _show(output: Output, rig: geometry.Rig, out: Path, *, placed: bool) -> None:
     rows: dict[str, dict[str, Any]] = {
         name: ({"centre_m": centre.tolist()} if placed else {}) | {"focal_length_px": float(K[0, 0])}
         for name, centre, K in zip(rig.names, rig.cameras.centre_world, rig.cameras.K, strict=True)
@@ -219,15 +217,12 @@ def doctor(
         max_offset_s: largest offset that is tried in seconds, in both directions, with --tracks.
     """
     from psotrack import api
-    from psotrack.calibration.clocks import reference_offset
-    from psotrack.recordings.datasets import open_recording
-    from psotrack.recordings.exchange import read_tracks
 
-    recording = open_recording(sequence, bodies=bodies)
+    recording = datasets.open_recording(sequence, bodies=bodies)
     if tracks is not None:
-        estimate = read_tracks(tracks, recording=recording)
+        estimate = exchange.read_tracks(tracks, recording=recording)
         with errors_name(f"{tracks} and {recording.folder}"):
-            output.result(reference_offset(recording, estimate, max_offset_s=max_offset_s))
+            output.result(clocks.reference_offset(recording, estimate, max_offset_s=max_offset_s))
         return
     diagnosis = api.doctor(
         recording,

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+from psotrack import inside_out, trajectories
 from psotrack.cli.commands import command
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
 from psotrack.errors import InputError, check_positive, errors_name
-
-if TYPE_CHECKING:
-    from psotrack.inside_out import CameraPath
-    from psotrack.trajectories import Trajectories
+from psotrack.recordings import exchange
 
 
 @command(without=["progress"])
@@ -46,36 +44,34 @@ def fuse(
             it.
         max_offset_s: estimate the offset of each on-board camera's clock, up to SECONDS. None: no clock has an offset.
     """
-    from psotrack.inside_out import fuse as fuse_paths
-    from psotrack.inside_out import read_camera_path, write_fused
-    from psotrack.recordings.exchange import read_tracks
-
     out = out or outside.with_name("fused.csv")
     check_suffix("--out", out, ".csv")
     output.refuse(out)
     if max_offset_s is not None:
         check_positive("--max-offset", max_offset_s)
-    paths: dict[str, CameraPath] = {}
+    paths: dict[str, inside_out.CameraPath] = {}
     for file in inside:
-        path, name = read_camera_path(file)
+        path, name = inside_out.read_camera_path(file)
         if name in paths:
             raise InputError(file, "the path of another drone", f"a second path of {name}")
         paths[name] = path
-    tracks = read_tracks(outside)
+    tracks = exchange.read_tracks(outside)
     if not any(path.seen.any() for path in paths.values()):
         where = ", ".join(map(str, inside))
         raise InputError(where, "a pose in at least one frame", "none")
     if max_offset_s is None:
         _check_times(paths, tracks, outside)
     with errors_name(outside):
-        fused = fuse_paths(paths, tracks, point=point, max_offset_s=max_offset_s)
-    write_fused(out, fused, force=output.force)
+        fused = inside_out.fuse(paths, tracks, point=point, max_offset_s=max_offset_s)
+    inside_out.write_fused(out, fused, force=output.force)
     output.json(fused.to_dict())
     *lines, whole = str(fused).splitlines()
     output.say(*lines, f"{out}: {whole}")
 
 
-def _check_times(paths: Mapping[str, CameraPath], tracks: Trajectories, outside: Path) -> None:
+def _check_times(
+    paths: Mapping[str, inside_out.CameraPath], tracks: trajectories.Trajectories, outside: Path
+) -> None:
     """Raise `InputError` if no path has times in common with the tracks."""
     begin_s, end_s = tracks.time_s[[0, -1]]
     spans = [path.time_s[[0, -1]] for path in paths.values()]

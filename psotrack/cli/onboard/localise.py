@@ -5,21 +5,19 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from msgspec import Meta
 
+from psotrack import inside_out, recordings, trajectories
 from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, onboard_videos
 from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
 from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import datasets
 from psotrack.support.interrupts import unhurried_end
-
-if TYPE_CHECKING:
-    from psotrack.inside_out import FrameSource, LineTime, LocalisedVideo, RollingShutter
-    from psotrack.recordings import OnboardVideo
 
 
 @dataclass(frozen=True)
@@ -111,16 +109,6 @@ def localise(
     from dataclasses import replace
 
     from psotrack.errors import check_positive
-    from psotrack.inside_out import (
-        LocaliseSettings,
-        MarkerMap,
-        PoseFilterParams,
-        PoseSettings,
-        read_marker_table,
-        write_camera_path,
-    )
-    from psotrack.inside_out import localise_video as localise_camera
-    from psotrack.recordings.datasets import find_marker_corners
 
     source, drone_name, onboard = _input(video, given)
     out = out or Path(f"{drone_name}.csv")
@@ -128,9 +116,9 @@ def localise(
     output.refuse(out)
     if given.markers is None and onboard is None:
         raise SettingsError("--markers", "a table of marker corners", "none")
-    table = given.markers or find_marker_corners(video)
-    marker_map = read_marker_table(table)
-    centres_only = not isinstance(marker_map, MarkerMap)
+    table = given.markers or datasets.find_marker_corners(video)
+    marker_map = inside_out.read_marker_table(table)
+    centres_only = not isinstance(marker_map, inside_out.MarkerMap)
     if given.side_m is not None:
         check_positive("--marker-size", given.side_m)
         if not centres_only:
@@ -139,22 +127,24 @@ def localise(
     name, source = source.name, source.first(num_frames)
     rows = source.image_size_wh[1]
     shutter = _shutter(poses.readout_s, rows, source.fps)
-    settings = LocaliseSettings(
+    settings = inside_out.LocaliseSettings(
         dictionary=given.dictionary,
-        pose=PoseSettings(
+        pose=inside_out.PoseSettings(
             min_markers=poses.min_markers,
             map_error_m=poses.map_error / 1e3,
             focal_error=poses.focal_error / 100,
         ),
-        filter=PoseFilterParams() if poses.filter else None,
+        filter=inside_out.PoseFilterParams() if poses.filter else None,
         shutter=shutter,
     )
     # What a stream has shown is kept: no one can show the stream again.
     with unhurried_end() if source.stream else contextlib.nullcontext():
-        found = localise_camera(source, marker_map, lens, settings, output.report, side_m=given.side_m)
+        found = inside_out.localise_video(
+            source, marker_map, lens, settings, output.report, side_m=given.side_m
+        )
         if poses.smooth:
             found = replace(found, path=found.smoothed(settings.filter))
-        write_camera_path(out, found.path, drone_name, force=output.force)
+        inside_out.write_camera_path(out, found.path, drone_name, force=output.force)
     content = _content(found, name, drone_name, settings.pose.min_markers)
     content |= {"track": str(out), "filtered": poses.filter, "smoothed": poses.smooth}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
@@ -165,55 +155,48 @@ def localise(
     output.say(*_lines_on_map(table, found, centres_only, video))
 
 
-def _input(video: str, given: SourceOptions) -> tuple[FrameSource, str, OnboardVideo | None]:
+def _input(
+    video: str, given: SourceOptions
+) -> tuple[inside_out.FrameSource, str, recordings.OnboardVideo | None]:
     """Frames, drone's name, and on-board video, if VIDEO is a sequence's folder and no video, images or stream."""
-    from psotrack.inside_out import open_source
-    from psotrack.recordings import IMAGE_SUFFIXES, is_picture_folder
-    from psotrack.recordings.datasets import read_onboard
-
     stream, folder = given.live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
     if video.isdecimal() and not stream and not folder.exists():
         raise InputError(video, "a video", "no such file", remedy="pass --live if it is a camera's number")
-    has_images = of_folder and is_picture_folder(folder)
-    if of_folder and read_onboard(folder):
+    has_images = of_folder and recordings.is_picture_folder(folder)
+    if of_folder and datasets.read_onboard(folder):
         chosen = onboard_videos(folder, None if given.drone is None else (given.drone,))
         if len(chosen) > 1:
             raise SettingsError("--drone", f"one of {', '.join(chosen)}", "none")
         ((drone, onboard),) = chosen.items()
-        return open_source(onboard.video.path, fps=given.fps), given.name or drone, onboard
+        return inside_out.open_source(onboard.video.path, fps=given.fps), given.name or drone, onboard
     if given.drone is not None:
         raise SettingsError("--drone", "a folder with videos of drones' own cameras", video)
     if of_folder and not has_images:
         raise InputError(
             folder,
-            f"images, which end in {', '.join(IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
+            f"images, which end in {', '.join(recordings.IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
             "neither",
             remedy="to use a video in a folder, name the video itself",
         )
     name = "camera" if stream else folder.name if of_folder else folder.stem
-    return open_source(video, fps=given.fps, live=given.live), given.name or name, None
+    return inside_out.open_source(video, fps=given.fps, live=given.live), given.name or name, None
 
 
-def _shutter(readout_s: float | None, rows: int, fps: float | None) -> RollingShutter | None:
+def _shutter(readout_s: float | None, rows: int, fps: float | None) -> inside_out.RollingShutter | None:
     """The shutter that --readout states; None without it."""
-    from psotrack.inside_out import RollingShutter
-
     if readout_s is None:
         return None
     longest_s = 1.0 if fps is None else 1 / fps
     if not 0 <= readout_s <= longest_s * (1 + 1e-9):
         of_frame = "" if fps is None else f", the time between two frames at {fps:g} frames per second"
         raise SettingsError("--readout", f"0 to {longest_s:.3g} s{of_frame}", f"{readout_s:g}")
-    return RollingShutter(readout_s / rows)
+    return inside_out.RollingShutter(readout_s / rows)
 
 
-def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:
+def _content(found: inside_out.LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:
     """The results as JSON, with null for missing numbers."""
     import numpy as np
-
-    from psotrack.inside_out import Flag
-    from psotrack.trajectories import Status
 
     path = found.path
     frames = path.num_frames
@@ -224,8 +207,8 @@ def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> 
         "frames": frames,
         "poses": int(path.seen.sum()),
         "own_poses": int(found.raw.seen.sum()),
-        "status": {status.label: int((path.status == status).sum()) for status in Status},
-        "flags": {flag.label: int(((path.flags & flag) != 0).sum()) for flag in Flag},
+        "status": {status.label: int((path.status == status).sum()) for status in trajectories.Status},
+        "flags": {flag.label: int(((path.flags & flag) != 0).sum()) for flag in inside_out.Flag},
         "min_markers": min_markers,
         "median_markers": float(np.median(path.num_markers)),
         "most_markers": int(path.num_markers.max()),
@@ -240,7 +223,7 @@ def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> 
     }
 
 
-def _lines_on_map(table: Path, found: LocalisedVideo, centres_only: bool, video: str) -> list[str]:
+def _lines_on_map(table: Path, found: inside_out.LocalisedVideo, centres_only: bool, video: str) -> list[str]:
     """What a user needs to know of the map."""
     lines = []
     wrong, count = found.wrong_markers, len(found.marker_map)
@@ -273,7 +256,10 @@ def _lines_on_map(table: Path, found: LocalisedVideo, centres_only: bool, video:
 
 
 def _shutter_content(
-    given: RollingShutter | None, used: RollingShutter, shown: LineTime | None, rows: int
+    given: inside_out.RollingShutter | None,
+    used: inside_out.RollingShutter,
+    shown: inside_out.LineTime | None,
+    rows: int,
 ) -> dict[str, Any]:
     """The shutter as JSON: that of --readout, that of the poses, and what the video shows, if it was looked for."""
     is_estimated = shown is not None and shown.is_shown
@@ -294,7 +280,7 @@ def _shutter_content(
     }
 
 
-def _shutter_sentence(given: RollingShutter | None, shown: LineTime | None) -> str:
+def _shutter_sentence(given: inside_out.RollingShutter | None, shown: inside_out.LineTime | None) -> str:
     """What the video shows of the shutter; empty where it confirms a global shutter or the given one."""
     if shown is None or (given is None and shown.is_shown and not shown.rolls):
         return ""

@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from msgspec import Meta
 
+from psotrack import inside_out, recordings
 from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, known_corners, leading, videos_of
 from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
 from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.recordings import datasets
 from psotrack.support import POSITION, finite_or_none, format_numbers
 
 if TYPE_CHECKING:
     from psotrack.foreground.markers import DetectedMarkers
-    from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap
 
 
 @command("detect")
@@ -54,7 +55,6 @@ def detect_markers(
         out: CSV file of the markers.
     """
     from psotrack.foreground.markers import marker_dictionary
-    from psotrack.inside_out import markers_of_images, markers_of_video, open_source, write_marker_table
 
     check_suffix("--out", out, ".csv")
     output.refuse(out)
@@ -63,13 +63,17 @@ def detect_markers(
     found: list[DetectedMarkers]
     if photographs is None:
         names, what = None, "frames"
-        found = list(markers_of_video(open_source(images[0]).first(num_frames), dictionary, output.report))
+        found = list(
+            inside_out.markers_of_video(
+                inside_out.open_source(images[0]).first(num_frames), dictionary, output.report
+            )
+        )
     else:
         if num_frames is not None:
             raise SettingsError("--frames", "a video", "images")
         names, what = _names(photographs), "images"
-        found = list(markers_of_images(photographs, dictionary, output.report))
-    write_marker_table(out, found, names, force=output.force)
+        found = list(inside_out.markers_of_images(photographs, dictionary, output.report))
+    inside_out.write_marker_table(out, found, names, force=output.force)
     counts = Counter(marker for markers in found for marker in markers.ids.tolist())
     showing = sum(len(markers) > 0 for markers in found)
     content = {
@@ -88,17 +92,15 @@ def detect_markers(
 
 def _photographs(images: tuple[Path, ...]) -> list[Path] | None:
     """Files of photographs, folders replaced by the images in them; None for a video."""
-    from psotrack.recordings import IMAGE_SUFFIXES, image_files, is_image
-
     paths: list[Path] = []
     for path in images:
         if path.is_dir():
-            inside = image_files(path)
+            inside = recordings.image_files(path)
             if not inside:
-                expected = f"images, which end in {', '.join(IMAGE_SUFFIXES)}"
+                expected = f"images, which end in {', '.join(recordings.IMAGE_SUFFIXES)}"
                 raise InputError(path, expected, "none in this folder")
             paths += inside
-        elif is_image(path) or not path.exists():
+        elif recordings.is_image(path) or not path.exists():
             paths.append(path)
         elif len(images) == 1:
             return None
@@ -193,16 +195,6 @@ def map_markers(
         out: table of corners to write. None: aruco_corners.csv.
         check: check the table MAP instead of writing one.
     """
-    from psotrack.inside_out import (
-        build_map,
-        check_map,
-        find_sightings,
-        fit_squares,
-        read_marker_map,
-        read_measured_corners,
-    )
-    from psotrack.recordings.datasets import write_marker_corners
-
     if out is not None and check is not None:
         raise SettingsError("onboard map", "--out FILE or --check MAP", "both")
     if check is None:
@@ -214,28 +206,30 @@ def map_markers(
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
             raise SettingsError("SOURCE", "one file of measured corners", f"{len(sources)} files")
-        measured = fit_squares(read_measured_corners(sources[0]), side_m=world.side_m)
-        write_marker_corners(out, measured.marker_map.corners_m, measured.marker_map.std_m)
+        measured = inside_out.fit_squares(inside_out.read_measured_corners(sources[0]), side_m=world.side_m)
+        datasets.write_marker_corners(out, measured.marker_map.corners_m, measured.marker_map.std_m)
         show_measured(output, measured, out)
         return
     # Errors of small files are found before the videos are read, which takes long.
-    marker_map = None if check is None else read_marker_map(check)
+    marker_map = None if check is None else inside_out.read_marker_map(check)
     known = {} if out is None else known_corners(world.known, world.markers, world.side_m, sources)
     videos = videos_of(sources, given.drone, lenses, given.fps)
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
-    sightings = find_sightings(list(videos.values()), given.dictionary, report=output.report)
+    sightings = inside_out.find_sightings(list(videos.values()), given.dictionary, report=output.report)
     if marker_map is not None:
-        checkup = check_map(sightings, marker_map)
+        checkup = inside_out.check_map(sightings, marker_map)
         show_check(output, checkup, Path(str(check)))
         if checkup.findings:
             sys.exit(FOUND)
     elif out is not None:
-        built = build_map(sightings, known, side_m=world.side_m, estimate_sides=world.estimate_sides)
-        write_marker_corners(out, built.marker_map.corners_m, built.marker_map.std_m or None)
+        built = inside_out.build_map(
+            sightings, known, side_m=world.side_m, estimate_sides=world.estimate_sides
+        )
+        datasets.write_marker_corners(out, built.marker_map.corners_m, built.marker_map.std_m or None)
         show_built(output, built, list(videos), out)
 
 
-def show_measured(output: Output, squares: FittedSquares, out: Path) -> None:
+def show_measured(output: Output, squares: inside_out.FittedSquares, out: Path) -> None:
     """Show a map from measured corners, and the distances of the corners from squares."""
     places = _places(squares.marker_map)
     off_m = squares.residual_m
@@ -253,7 +247,7 @@ def show_measured(output: Output, squares: FittedSquares, out: Path) -> None:
     output.say(f"{out}: {len(places)} markers, corners within {worst_mm:.1f} mm of squares (marker {worst})")
 
 
-def show_built(output: Output, built: BuiltMap, videos: list[str], out: Path) -> None:
+def show_built(output: Output, built: inside_out.BuiltMap, videos: list[str], out: Path) -> None:
     """Show a map from videos, given their names, with the standard deviation of each marker's position."""
     rows = _places(built.marker_map)
     for index, row in enumerate(rows.values()):
@@ -297,7 +291,7 @@ def show_built(output: Output, built: BuiltMap, videos: list[str], out: Path) ->
     output.say(f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 
-def show_check(output: Output, checkup: MapCheck, path: Path) -> None:
+def show_check(output: Output, checkup: inside_out.MapCheck, path: Path) -> None:
     """Show the markers of a map, whose table is at a path, that videos see elsewhere."""
     output.json({"map": str(path), **checkup.to_dict()})
     output.say(*map(str, checkup.findings), always=True)
@@ -305,7 +299,7 @@ def show_check(output: Output, checkup: MapCheck, path: Path) -> None:
         output.say(f"{path}: nothing disagrees")
 
 
-def _places(marker_map: MarkerMap) -> dict[int, dict[str, Any]]:
+def _places(marker_map: inside_out.MarkerMap) -> dict[int, dict[str, Any]]:
     """Centre, normal and side of each marker, by id, fit for JSON."""
     rows = zip(marker_map.centres_m, marker_map.normals, marker_map.sides_m, strict=True)
     return {

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
+from psotrack import geometry, inside_out, recordings, support
 from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import datasets
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from psotrack.geometry import Camera
-    from psotrack.recordings import OnboardVideo, VideoInfo
 
 #: Rate of pictures where none is given. A map does not depend on the rate, only the time from row to row does.
 PICTURES_FPS = 25.0
@@ -24,20 +24,16 @@ def known_corners(
     known: str | None, table: Path | None, side_m: float | None, sources: tuple[Path, ...]
 ) -> dict[int, np.ndarray]:
     """Corners of the known markers, (4, 3) in metres, by id."""
-    from psotrack.inside_out import corners_in_own_frame, read_marker_map
-    from psotrack.recordings.datasets import find_marker_corners, is_recording
-    from psotrack.support import whole_number
-
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
-    numbers = [whole_number(word) for word in words]
+    numbers = [support.whole_number(word) for word in words]
     ids = list(dict.fromkeys(number for number in numbers if number is not None))
     if not numbers or None in numbers:
         expected = "numbers of markers that are known, such as 7 or 7,12"
         raise SettingsError("--known", expected, known or "none")
-    if table is None and side_m is None and is_recording(sources[0]):
-        table = find_marker_corners(sources[0])
+    if table is None and side_m is None and datasets.is_recording(sources[0]):
+        table = datasets.find_marker_corners(sources[0])
     if table is not None:
-        marker_map = read_marker_map(table)
+        marker_map = inside_out.read_marker_map(table)
         missing = [marker for marker in ids if marker not in marker_map]
         if missing:
             found = f"only {', '.join(map(str, marker_map.ids.tolist()))}"
@@ -46,7 +42,7 @@ def known_corners(
     if side_m is None or len(ids) > 1:
         expected = "--markers with the corners of the known markers, or --side and one known marker"
         raise SettingsError("--known", expected, "no --markers" if side_m is not None else "neither")
-    return {ids[0]: corners_in_own_frame(side_m)}
+    return {ids[0]: inside_out.corners_in_own_frame(side_m)}
 
 
 @dataclass(frozen=True)
@@ -67,18 +63,18 @@ class OnboardLensOptions:
 
     def of(
         self, size_wh: tuple[int, int], index: int = 0, count: int = 1, K: np.ndarray | None = None
-    ) -> Camera:
+    ) -> geometry.Camera:
         """Lens of video number `index` of `count` videos, whose images have `size_wh` pixels; K is the sequence's."""
-        from psotrack.inside_out import choose_lens, lens_from_matrix
-
         if K is not None and self.file is None and self.fov_deg is None:
-            return lens_from_matrix(K, size_wh)
+            return inside_out.lens_from_matrix(K, size_wh)
         names: tuple[str | None, ...] = self.names or (None,)
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
             raise SettingsError("--camera-name", expected, f"{len(names)}")
         name = names[index % len(names)]
-        return choose_lens(size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale)
+        return inside_out.choose_lens(
+            size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale
+        )
 
 
 #: Names of the options of `Lenses`.
@@ -90,12 +86,9 @@ def videos_of(
     drones: tuple[str, ...] | None,
     lenses: OnboardLensOptions,
     fps: float | None = None,
-) -> dict[str, tuple[VideoInfo, Camera]]:
+) -> dict[str, tuple[recordings.VideoInfo, geometry.Camera]]:
     """Videos with their lenses, by name; a folder of pictures is a video of `fps` frames per second."""
-    from psotrack.recordings import is_picture_folder, open_video
-    from psotrack.recordings.datasets import is_recording
-
-    if is_recording(sources[0]):
+    if datasets.is_recording(sources[0]):
         if len(sources) > 1:
             raise SettingsError("SOURCE", "one sequence, or videos", f"{len(sources)} sources")
         onboard = onboard_videos(sources[0], drones)
@@ -105,19 +98,17 @@ def videos_of(
         }
     if drones is not None:
         raise SettingsError("--drone", "a sequence's folder as SOURCE", f"{sources[0]}")
-    rates = [fps or (PICTURES_FPS if is_picture_folder(path) else None) for path in sources]
-    infos = [open_video(path, rate) for path, rate in zip(sources, rates, strict=True)]
+    rates = [fps or (PICTURES_FPS if recordings.is_picture_folder(path) else None) for path in sources]
+    infos = [recordings.open_video(path, rate) for path, rate in zip(sources, rates, strict=True)]
     return {
         str(video.path): (video, lenses.of(video.image_size_wh, index, len(infos)))
         for index, video in enumerate(infos)
     }
 
 
-def onboard_videos(folder: Path, names: tuple[str, ...] | None) -> dict[str, OnboardVideo]:
+def onboard_videos(folder: Path, names: tuple[str, ...] | None) -> dict[str, recordings.OnboardVideo]:
     """Videos of the cameras on a sequence's drones, by name: all of them, or those of some names."""
-    from psotrack.recordings.datasets import read_onboard
-
-    onboard = read_onboard(folder)
+    onboard = datasets.read_onboard(folder)
     if not onboard:
         raise InputError(folder, "videos of drones' own cameras, such as dron1_cam_s.avi", "none")
     unknown = [name for name in names or () if name not in onboard]
@@ -126,7 +117,7 @@ def onboard_videos(folder: Path, names: tuple[str, ...] | None) -> dict[str, Onb
     return {name: onboard[name] for name in names or onboard}
 
 
-def leading(video: VideoInfo, num_frames: int | None) -> VideoInfo:
+def leading(video: recordings.VideoInfo, num_frames: int | None) -> recordings.VideoInfo:
     """A video cut to its first `num_frames` frames; None keeps all frames."""
     if num_frames is None:
         return video

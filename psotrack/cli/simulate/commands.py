@@ -16,7 +16,9 @@ from psotrack.cli.options import Jobs
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError, errors_name
+from psotrack.foreground import detection
 from psotrack.foreground.detection import LabelSettings
+from psotrack.recordings import datasets
 from psotrack.support.interrupts import unhurried_end
 
 
@@ -142,19 +144,18 @@ def fly(
     """
     import numpy as np
 
-    from psotrack.simulation import flight_space, write_recorded_flight
     from psotrack.simulation.flights.piloting import fly, open_device, write_sticks
 
     sticks_path = out.with_suffix(".sticks.csv")
     check_suffix("--out", out, ".csv")
     output.refuse(out, sticks_path)
-    space = flight_space(hall)
+    space = simulation.flight_space(hall)
     # Ctrl-C ends the flight, which is then written.
     with unhurried_end(), errors_name(device):
         with open_device(device, space) as (samples, watch):
             known: dict[str, Any] = {"rate_hz": rate_hz, "max_s": max_seconds, "watch": watch}
             recorded, used = fly(samples, np.array(start_m), space, **known)
-        write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+        simulation.write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
         write_sticks(sticks_path, used)
     output.say(
         f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s",
@@ -188,11 +189,8 @@ def labels(
         out: folder of the training set.
         validation: sequences for validation, not for training. None: the last sequence.
     """
-    from psotrack.foreground.detection import DATA_SET, write_data_set
-    from psotrack.recordings.datasets import open_recording
-
-    counts = write_data_set(
-        [open_recording(sequence) for sequence in sequences],
+    counts = detection.write_data_set(
+        [datasets.open_recording(sequence) for sequence in sequences],
         out,
         settings,
         validation=validation or (),
@@ -202,4 +200,4 @@ def labels(
     )
     output.json(counts)
     shown = "; ".join(f"{part}: {of['images']} images, {of['labels']} labels" for part, of in counts.items())
-    output.say(f"{out / DATA_SET}: {shown}")
+    output.say(f"{out / detection.DATA_SET}: {shown}")
