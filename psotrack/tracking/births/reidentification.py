@@ -42,6 +42,8 @@ STILL_S = (1.0, 0.5)
 #: A candidate stayed at a place, or departed from it, if it is nearer to the place than this number of spans, or was so
 #: within the last `DEPARTURE_S` seconds.
 STAYED_SPANS, DEPARTURE_S = 0.6, 0.6
+#: Probability that a drone stops or turns at once while it is out of sight, so that it is anywhere within reach.
+TURNED_PROBABILITY = 0.1
 #: Odds of a new drone against a lost drone where no new ones come, and of no drone if the candidate does not move. A
 #: candidate that is not sure waits for the frames that make it so, unless a lost drone is clearly more probable.
 NEW_ODDS, UNSURE_ODDS, NO_DRONE_ODDS = 0.1, 3.0, 10.0
@@ -302,12 +304,16 @@ def _log_likelihood(
         return _IMPOSSIBLE
     gap_s = max(gap_s, 0.0)
     distance = float(np.linalg.norm(candidate.position_m - place))
-    if distance > limits.max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
+    reach_m = limits.max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M
+    if distance > reach_m:
         return _UNREACHABLE - distance
     before = np.stack([place, velocity])
     after = np.stack([candidate.position_m, candidate.velocity_m_s])
+    log_turned = np.log(TURNED_PROBABILITY / (4 / 3 * np.pi * reach_m**3))
+    log_turned += _log_velocity(candidate.velocity_m_s, limits)
     log_flown = max(
-        log_transition(before, after, gap_s, each, limits.bounds_m) for each in _speeds2(velocity, limits)
+        log_turned,
+        *(log_transition(before, after, gap_s, each, limits.bounds_m) for each in _speeds2(velocity, limits)),
     )
     num_flying = sum(
         not doubtful and not _stands(lost, each, limits) for each, doubtful in enumerate(lost.doubtful)
