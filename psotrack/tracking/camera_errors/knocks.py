@@ -1,10 +1,10 @@
 """A camera that is knocked in mid-flight: from one frame on it shows everything elsewhere.
 
 Each camera's places are compared with where the other cameras put the body. A knock is a step between two frames that
-stays to the end, and that windows of some frames on both sides show as large as long ones do. How large a step has to
-be, the recording itself shows: errors that change with the attitude and the place of a body make differences between
-neighbouring windows everywhere. Where another camera begins or ends to see the body, or nobody sees the body for a
-time, the errors of a rig make steps of their own, which are no knocks.
+windows of some frames on both sides show as large as long ones do, and all frames before and after that the same
+cameras show. How large a step has to be, the recording itself shows: errors that change with the attitude and the place
+of a body make differences between neighbouring windows everywhere. Where another camera begins or ends to see the body,
+or nobody sees the body for a time, the errors of a rig make steps of their own, which are no knocks.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from psotrack.tracking.camera_errors.variance_components import FittedPlaces
 _WINDOWS = (10, 20, 40, 80)
 #: A step has this many times the length that a difference between neighbouring windows usually has.
 _CLEAR = 6.0
-#: Least part of a step that the shortest window shows, and the means of all frames before and after.
-_STAYS = 0.5
+#: Least part of a step that the shortest window shows; part that all frames before and after show.
+_SUDDEN, _STAYS = 0.5, (0.75, 1 / 0.75)
 #: Largest change of the share of frames in which another camera sees the body, from one window to the next; largest
 #: length of both windows, in frames of the recording for each frame that the camera shows.
 _OTHERS_CHANGE, _DENSE = 0.2, 2.0
@@ -106,6 +106,7 @@ def _steps(
     """The clearest step of a camera, by each length of the windows, if it is one."""
     shown_so_far = np.concatenate([np.zeros((1, shown.shape[1])), np.cumsum(shown, axis=0)])
     total = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(equations, axis=0)])
+    _, sets = np.unique(shown > 0, axis=0, return_inverse=True)
     for window in _WINDOWS:
         if len(frames) < 6 * window:
             break
@@ -118,17 +119,44 @@ def _steps(
         best = int(np.where(alike, clear, 0.0).argmax())
         at = first[best]
         shortest = total[at] - total[at - _WINDOWS[0] // 2], total[at + _WINDOWS[0] // 2] - total[at]
-        stays = [
-            _change(*each)[0] @ change_px[best] for each in (shortest, (total[at], total[-1] - total[at]))
-        ]
-        length2 = float(change_px[best] @ change_px[best])
+        length2, sudden = (
+            float(change_px[best] @ change_px[best]),
+            float(_change(*shortest)[0] @ change_px[best]),
+        )
+        part = _part_that_stays(change_px[best], equations, sets, int(at))
         clearly = float(np.sqrt(clear[best])) / max(float(usual), np.finfo(float).tiny)
-        if clearly > _CLEAR and length2 > _LEAST_PX**2 and min(stays) > _STAYS * length2:
+        if (
+            clearly > _CLEAR
+            and length2 > _LEAST_PX**2
+            and sudden > _SUDDEN * length2
+            and _STAYS[0] < part < _STAYS[1]
+        ):
             levels_px = [
                 _solved(each)[0] for each in (total[at] - total[at - window], total[at + window] - total[at])
             ]
             at = at - window + _likeliest_split(equations[at - window : at + window], *levels_px)
             yield Knock(int(frames[at]), camera, change_px[best], clearly)
+
+
+def _part_that_stays(
+    shift_px: Float[np.ndarray, "2"],
+    equations: Float[np.ndarray, "frames 2 3"],
+    sets: Int[np.ndarray, "frames"],
+    at: int,
+) -> float:
+    """Part of a shift that all frames before and after a step show, each set of cameras by what it tells of it.
+
+    Other cameras show the body elsewhere by the errors of the rig.
+    """
+    part = whole = 0.0
+    for one in np.intersect1d(sets[:at], sets[at:]).tolist():
+        (before_px, before), (after_px, after) = (
+            _solved(some[number == one].sum(axis=0))
+            for some, number in ((equations[:at], sets[:at]), (equations[at:], sets[at:]))
+        )
+        told = shift_px @ np.linalg.inv(before + after)
+        part, whole = part + float(told @ (after_px - before_px)), whole + float(told @ shift_px)
+    return part / whole if whole else 0.0
 
 
 def _likeliest_split(
