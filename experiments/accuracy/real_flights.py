@@ -208,13 +208,13 @@ def tracked(folder: Path, name: str, without: str, num_frames: int) -> dict[str,
         run = prepare(recording, None, {}, TrackSettings(method="projection-lines"), Parts())
         assert run.sightings is not None
         tracks, places = track_detections(
-            recording.rig.cameras,
+            run.recording.rig.cameras,
             run.sightings,
             run.settings,
             fps=recording.fps,
             bounds_m=run.volume.bounds_m,
         )
-        found = {"tracks": tracks, "places": places, "cameras": recording.rig.cameras}
+        found = {"tracks": tracks, "places": places, "cameras": run.recording.rig.cameras}
         found |= {"names": recording.rig.names, "fps": recording.fps, "time_s": recording.timeline().time_s}
         kept.write_bytes(pickle.dumps(found | {"settings": run.settings}))
     found = pickle.loads(kept.read_bytes())

@@ -103,7 +103,7 @@ def without_knocked(run: Run, knock: Knock) -> Recording | None:
 
     Warns of the knock, and says which of both it is.
     """
-    recording = run.recording
+    recording = run.given
     name, timeline = recording.rig.names[knock.camera], recording.timeline()
     rest = np.delete(np.arange(len(recording.rig)), knock.camera)
     enough = len(np.unique(viewpoints(recording.rig.cameras[rest]))) >= _LEAST_VIEWPOINTS

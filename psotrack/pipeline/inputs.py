@@ -34,7 +34,7 @@ from psotrack.tracking.births import (
     start_source,
 )
 from psotrack.tracking.camera_errors import Knock
-from psotrack.tracking.matching import Sightings, from_detections, from_silhouettes
+from psotrack.tracking.matching import Sightings, from_detections, from_silhouettes, straightened
 from psotrack.tracking.swarm import Score, Search
 from psotrack.trajectories import Tracks
 
@@ -256,6 +256,7 @@ class Run:
 
     Attributes:
         recording, silhouettes: those at the instants of the run.
+        given: the recording with its own lenses; `recording` is without those that fold (see `straightened`).
         settings: settings of the run, with the speed limit that was found.
         parts: parts that the caller brings.
         source: source of the first positions.
@@ -269,6 +270,7 @@ class Run:
     """
 
     recording: Recording
+    given: Recording
     silhouettes: Silhouettes | None
     settings: TrackSettings
     parts: Parts
@@ -311,6 +313,9 @@ def prepare(
     if settings.method != "swarm" if plugin is None else plugin.reads_detections:
         source = settings.detections
         sightings, keys = read_sightings(recording, silhouettes, source, report)
+    given = recording
+    if sightings is not None and silhouettes is None and plugin is None:
+        recording, sightings = _without_folds(recording, sightings)
     read_s = time.perf_counter() - began
     bounds_m, speed_m_s = settings.bounds_m or recording.bounds_m, settings.motion.max_speed_m_s
     size_m = settings.drones.size_m
@@ -321,4 +326,17 @@ def prepare(
     volume = flight_volume(recording.rig, points.get(key), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)
-    return Run(recording, silhouettes, settings, parts, start, volume, plugin, sightings, keys, read_s)
+    return Run(recording, given, silhouettes, settings, parts, start, volume, plugin, sightings, keys, read_s)
+
+
+def _without_folds(recording: Recording, sightings: Sightings) -> tuple[Recording, Sightings]:
+    """The recording and its detections, without the lenses that fold within the image; warns of these."""
+    rig, sightings, names = straightened(recording.rig, sightings)
+    if not names:
+        return recording, sightings
+    logger.warning(
+        "the lens of %s folds within the image, as no real one does: its calibration does not hold near the border, "
+        "where it is continued; calibrate it with points that reach the border",
+        ", ".join(names),
+    )
+    return recording.with_rig(rig), sightings

@@ -209,7 +209,7 @@ def _track(
             clocks = estimate_clocks(run, result.tracks)
             warn_of_unknown_clocks(clocks, run.recording)
             once = msgspec.structs.replace(given, clocks="given")
-            corrected = with_clocks(run.recording, clocks)
+            corrected = with_clocks(run.given, clocks)
             ((again, result),) = _track(corrected, silhouettes, [once], parts, report)
             run = replace(
                 again, settings=msgspec.structs.replace(again.settings, clocks="auto"), clocks=clocks

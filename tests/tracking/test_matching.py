@@ -17,15 +17,17 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import project
+from psotrack.geometry import make_camera, project, undistort
 from psotrack.recordings import Detections
 from psotrack.tracking.matching import (
     NEW_GROUP_COST,
     SHARED_COST,
     UNEXPLAINED_COST,
+    Sightings,
     epipolar_distance,
     from_detections,
     match,
+    straightened,
 )
 
 BOUNDS_M = np.array([[-4.0, -4.0, -1.0], [4.0, 4.0, 4.0]])
@@ -321,3 +323,21 @@ def test_order_and_world_frame_do_not_matter(seed):
     there = match_points(move_world(rig, R, shift_m), points, 2.0, bounds_m=wide)
     here = match_points(rig, points, 2.0, bounds_m=wide - shift_m)
     assert groups_of(there) == groups_of(here)
+
+
+def test_a_lens_that_folds_within_the_image_is_continued():
+    """A published lens has no ray for pixels near the border; the camera shows a drone there."""
+    K, pose = np.array([[1570.0, 0, 960], [0, 1570, 540], [0, 0, 1]]), {"R": np.eye(3), "t_m": np.zeros(3)}
+    lenses = (np.array(dist) for dist in ((0.013, 0.96, 0, 0, -4.15), (-0.1, 0.01, 0, 0, 0)))
+    cameras = [make_camera(**pose, K=K, dist=dist, image_size_wh=(1920, 1080)) for dist in lenses]
+    pixels = np.array([[[[500.0, 400.0], [60.0, 250.0]]] * 2])
+    sightings = Sightings(pixels, np.full(pixels.shape, 10.0), np.full(pixels.shape[:-1], 2.0))
+    straight, seen, names = straightened(make_unnamed_rig(*cameras), sightings)
+    assert len(names) == 1
+    assert straight.cameras.dist.any(axis=-1).tolist() == [False, True]
+    rays = undistort(cameras[0], pixels[0, 0])
+    assert np.isnan(rays[1]).all()
+    np.testing.assert_allclose(seen.centre_px[0, 0, 0], rays[0] * 1570 + K[:2, 2])
+    # Beyond the points of its calibration this lens is a pinhole, but for some per cent of the radius of 945 px.
+    np.testing.assert_allclose(seen.centre_px[0, 0, 1], pixels[0, 0, 1], atol=0.03 * 945)
+    np.testing.assert_array_equal(seen.centre_px[0, 1], pixels[0, 1])

@@ -16,6 +16,7 @@ from .sightings import (
     from_silhouettes,
     moved_to_instant,
 )
+from .straightened import straightened
 
 __all__ = [
     "BORDER_PX",
@@ -40,5 +41,6 @@ __all__ = [
     "from_silhouettes",
     "match",
     "moved_to_instant",
+    "straightened",
     "wide_bounds",
 ]
