@@ -7,6 +7,7 @@ screens change, ghosts go, and hovering drones stay foreground.
 from __future__ import annotations
 
 import functools
+import itertools
 
 import cv2
 import numpy as np
@@ -254,6 +255,33 @@ class TestLiving:
         assert found >= 0.98 * len(frames)
         assert false_blobs <= 0.5 * len(frames)
 
+    @pytest.mark.parametrize("level", [80, 200])
+    def test_a_fast_ball_beside_a_person_is_found(self, level):
+        """Ten balls of 8 px fly at 20 px a frame, blurred over 18 px, past a person who walks.
+
+        Found: of such balls in a video, 7 of 17 and 4 of 9 were found; their soft ends were taken for those of clouds.
+        """
+        rng = np.random.default_rng(2)
+        wall = np.dstack([110 + 60 * _smooth(rng, HEIGHT, WIDTH)] * 3)
+        frames, balls = [], []
+        for height, flown in itertools.product(rng.uniform(8, 40, 10), range(8)):
+            ball = np.array([10 + 20 * flown, height + flown**2 / 4])
+            open_shutter = np.zeros((HEIGHT, WIDTH))
+            for along_px in np.linspace(-9, 9, 13):
+                x, y = np.rint(16 * (ball + np.array([along_px, 0]))).astype(int).tolist()
+                open_shutter += cv2.circle(np.zeros((HEIGHT, WIDTH)), (x, y), 64, 1 / 13, -1, shift=4)
+            share = cv2.GaussianBlur(open_shutter, (0, 0), 0.7)[..., None]
+            image = wall * (1 - share) + level * share
+            left = 30 + len(frames)
+            image[68:, left : left + 18] = (60, 50, 90)
+            frames.append(_exposed(image, rng))
+            balls.append(ball)
+        is_found = []
+        for mask, ball in zip(Living(SETTINGS).foreground(frames[::2], frames), balls, strict=True):
+            middle = cv2.connectedComponentsWithStats(mask)[3][1:]
+            is_found.append((np.linalg.norm(middle - ball, axis=1) < 6).any())
+        assert np.mean(is_found) >= 0.9
+
     def test_a_place_that_drones_cross_stays_calm(self):
         """A pale drone is found in full where dark drones crossed before: each of them is no change that goes on."""
         rng = np.random.default_rng(3)
@@ -409,7 +437,7 @@ def test_the_slopes_of_a_cloud_are_no_contour_however_much_it_changes_the_image(
     changed = np.where(cloud > 3, np.uint8(255), np.uint8(0))
     strong = np.where(cloud > 8, np.uint8(255), np.uint8(0))
     calm = np.zeros((HEIGHT, WIDTH), bool)
-    found = find_objects(changed, strong, cloud, calm, 9)
+    found = find_objects(changed, strong, cloud, np.zeros_like(cloud), calm, 9)
     assert not found.mask.any()
 
 

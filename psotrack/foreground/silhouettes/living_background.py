@@ -104,7 +104,7 @@ class Living:
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
         used = ("working_reduction", "num_learning_frames", "min_blob_px", "soft_edges", "first_look")
-        return {"living": 3, **{name: getattr(self.settings, name) for name in used}}
+        return {"living": 4, **{name: getattr(self.settings, name) for name in used}}
 
     def foreground(
         self,
@@ -253,6 +253,7 @@ class _Scene:
         self._num_learned, self._num_changed, self._expected_until = 0, 0, 0
         self._objects = np.zeros(shape, np.uint8)
         self._foreground: _Mask = np.zeros(shape, np.uint8)
+        self._before: _Mask = np.full(shape, 255, np.uint8)
         self._expect()
 
     def _begin_mog2(self, variance: float | None = None) -> None:
@@ -293,7 +294,8 @@ class _Scene:
         touching = cv2.dilate(_white(labels == _FOREGROUND), _TOUCHING)
         changed = cv2.bitwise_and(touching, _white(labels > 0))
         strong = cv2.bitwise_and(changed, cv2.compare(difference, usual, cv2.CMP_GT))
-        found = find_objects(changed, strong, difference, self._is_restless, self._least_px)
+        found = find_objects(changed, strong, difference, self._before, self._is_restless, self._least_px)
+        self._before = difference
         self._last_look = _Look(image, difference, differs, labels, found, log_gain)
         self._foreground = found.mask
         return _with_soft_edges(found.mask, difference) if self._soft_edges else found.mask

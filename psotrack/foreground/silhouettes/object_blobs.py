@@ -5,7 +5,7 @@
   so that the pale parts of a drone belong to the blob. Where the contour at this share is not steep almost all around,
   a larger share is taken, so that a small dark drone does not grow together with the faint change of a cloud.
 - **Sharpness**: the difference to the background rises steeply at the blob's contour. Clouds, soft shadows and lamps
-  change the image gradually.
+  change the image gradually. A fast object is blurred along its path; it is not where it was in the frame before.
 - **Edges**: an object has edges of its own in the frame. Where an object left, the background has these edges instead
   (a ghost); where leaves or waves move, both have edges.
 """
@@ -33,6 +33,10 @@ _STEEP = 0.5
 #: noise and codecs add. In shares of the mean difference, drawn and real drones have 0.5 to 3 down to 3 px; drifting
 #: clouds 0.06 to 0.5.
 _SHARP, _NOISE_GRADIENT = 0.4, 2.0
+#: The share for a fast object, such as a ball of 10 px that is blurred over 30: the frame before showed less than this
+#: share of its difference at the same place, and so many of its pixels are strong. Of speckle in a codec's key frames,
+#: which comes suddenly too, fewer are.
+_SHARP_FAST, _SEEN_BEFORE, _FAST_STRONG = 0.25, 0.5, 0.6
 #: Larger differences do not need sharper contours, grey levels.
 _SHARP_DIFFERENCE = 40.0
 #: Edges of an object at its contour, relative to the background's edges at the same place, and above them.
@@ -75,6 +79,7 @@ def find_objects(
     changed: _Mask,
     strong: _Mask,
     difference: _Mask,
+    before: _Mask,
     restless: Bool[np.ndarray, "height width"],
     least_px: int,
 ) -> ObjectBlobs:
@@ -84,6 +89,7 @@ def find_objects(
         changed: (height, width), above 0 at the pixels that differ from the background.
         strong: (height, width), above 0 at the pixels that differ by more than the place usually does.
         difference: (height, width), the largest difference of the channels, grey levels.
+        before: (height, width), that of the frame before.
         restless: (height, width), whether leaves, screens, waves or noise change the place again and again.
         least_px: smallest number of pixels of a blob.
     """
@@ -93,13 +99,16 @@ def find_objects(
         num_restless = blobs.sums(restless.ravel()[blobs.pixels])
         enough = _CALM_SHARE * (blobs.area - num_restless) + _RESTLESS_SHARE * num_restless
         num_strong = blobs.sums(strong.ravel()[blobs.pixels] > 0)
+        mostly_strong = num_strong > _FAST_STRONG * blobs.area
         blobs = blobs.chosen(num_strong >= np.maximum(_STRONG_PIXELS, enough))
         if not blobs.area.any():
             break
         contours = _contours(blobs, changed.shape)
         levels, steepness = difference.ravel()[blobs.pixels], _gradient_at(difference, contours.pixels)
-        contrast = np.minimum(blobs.means(levels), _SHARP_DIFFERENCE)
-        is_sharp = contours.means(steepness) > _SHARP * contrast + _NOISE_GRADIENT
+        mean = blobs.means(levels)
+        is_fast = mostly_strong & (blobs.means(before.ravel()[blobs.pixels]) < _SEEN_BEFORE * mean)
+        sharp = np.where(is_fast, _SHARP_FAST, _SHARP) * np.minimum(mean, _SHARP_DIFFERENCE)
+        is_sharp = contours.means(steepness) > sharp + _NOISE_GRADIENT
         # Where the difference is a step, and not the slope of a cloud.
         step = _STEEP * _ending_level(blobs, levels, share) + _NOISE_GRADIENT
         is_steep = contours.means(steepness > step[contours.blob]) >= steep_part
