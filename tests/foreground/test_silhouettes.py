@@ -64,7 +64,7 @@ NUM_USABLE, SHAKEN = 80, range(40, 55)
 
 
 def _write_video(
-    path: Path, seed: int, num_frames: int = NUM_FRAMES, *, shaken=(), frozen=(), black=()
+    path: Path, seed: int, num_frames: int = NUM_FRAMES, *, shaken=(), frozen=(), black=(), turns_at=None
 ) -> None:
     """A video of a dark disc that moves in front of a smooth texture, with noise."""
     rng = np.random.default_rng(seed)
@@ -78,6 +78,8 @@ def _write_video(
             elif index in shaken:
                 image = cv2.resize(rng.uniform(0, 255, (12, 16, 3)), SIZE_WH)
             x = 20 + 120 * index // num_frames
+            if turns_at:
+                x = 140 - round(4 * abs(index - turns_at))
             cv2.circle(image, (x, 30 + 10 * seed), 9, (25, 25, 25), -1, cv2.LINE_AA)
             if index not in frozen:
                 picture = np.clip(image, 0, 255).astype(np.uint8)
@@ -553,6 +555,13 @@ def test_a_camera_is_left_out_for_as_long_and_a_line_says_which_and_when(tmp_pat
     boxes = blob_detections(made, np.array([SIZE_WH, SIZE_WH], float))
     with_blobs = set(boxes["shaken"].frame.tolist())
     assert with_blobs == set(range(NUM_USABLE)) - set(SHAKEN)
+
+
+def test_a_frame_in_which_what_moves_stands_still_for_a_moment_is_no_repetition(tmp_path, make):
+    """Found: one of 60 frames of a calm video was left out. A disc turns back between the frames 20 and 21."""
+    _write_video(tmp_path / "calm.avi", 1, 60, turns_at=20.5)
+    _write_video(tmp_path / "frozen.avi", 1, 60, turns_at=20.5, frozen=(33, 41, 42))
+    assert make(_make_recording(tmp_path)).left_out == {"frozen": [(33, 34), (41, 43)]}
 
 
 # --- blobs

@@ -74,7 +74,7 @@ def is_whole(folder: Path) -> bool:
 
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
-SCHEMA = 3
+SCHEMA = 4
 
 #: Number of frames that are compressed and read together.
 CHUNK_FRAMES = 25
