@@ -31,7 +31,7 @@ from .rig.point_files import (
 )
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.shifts import Shift, find_board_shifts, find_point_shifts
-from .rig.start import choose_lens_model
+from .rig.start import LensViews, choose_lens_model
 from .rig.views import (
     BoardViews,
     CameraImages,
@@ -63,6 +63,7 @@ __all__ = [
     "LensChoice",
     "LensModel",
     "LensSettings",
+    "LensViews",
     "Located",
     "PointRig",
     "PointSettings",

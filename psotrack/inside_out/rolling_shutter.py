@@ -81,52 +81,41 @@ def spline_through(time_s: Sequence[float], poses: Sequence[tuple[np.ndarray, np
     return lambda times: (position_m(times), turns(times).as_matrix())
 
 
-def row_times_s(
-    corners_px: Float[np.ndarray, "*corners 2"], lens: Camera, line_time_s: float
-) -> Float[np.ndarray, "*corners"]:
-    """When the rows of corners were exposed, after the middle row of the image, seconds."""
-    return line_time_s * (corners_px[..., 1] - (float(lens.image_size_wh[1]) - 1) / 2)
+@dataclass(frozen=True)
+class SeenRows:
+    """Corners in one frame, whose rows were exposed one after the other.
 
+    Attributes:
+        corners_px: (markers, 4, 2), pixels.
+        corners_m: (markers, 4, 3), the same corners in the world, metres.
+        lens: intrinsics of the camera.
+        time_s: when the middle row was exposed, seconds.
+    """
 
-def at_middle_row(
-    corners_px: Float[np.ndarray, "markers 4 2"],
-    corners_m: Float[np.ndarray, "markers 4 3"],
-    lens: Camera,
-    line_time_s: float,
-    time_s: float,
-    poses_at: PosesAt,
-) -> Float[np.ndarray, "markers 4 2"]:
-    """(markers, 4, 2), pixels of corners as the middle row's pose shows them, of a frame at `time_s`."""
-    return corners_px - shift_of_rows(corners_px, corners_m, lens, (0.0, line_time_s), time_s, poses_at)
+    corners_px: Float[np.ndarray, "markers 4 2"]
+    corners_m: Float[np.ndarray, "markers 4 3"]
+    lens: Camera
+    time_s: float
 
+    def late_s(self, line_time_s: float) -> Float[np.ndarray, "markers 4"]:
+        """(markers, 4), when the rows of the corners were exposed, after the middle row, seconds."""
+        return line_time_s * (self.corners_px[..., 1] - (float(self.lens.image_size_wh[1]) - 1) / 2)
 
-def shift_of_rows(
-    corners_px: Float[np.ndarray, "markers 4 2"],
-    corners_m: Float[np.ndarray, "markers 4 3"],
-    lens: Camera,
-    line_times_s: tuple[float, float],
-    time_s: float,
-    poses_at: PosesAt,
-) -> Float[np.ndarray, "markers 4 2"]:
-    """(markers, 4, 2), change of the pixels from the first line time to the second; 0 behind the camera."""
-    first, second = (
-        _seen_at(time_s + row_times_s(corners_px, lens, line_time_s), corners_m, lens, poses_at)
-        for line_time_s in line_times_s
-    )
-    return np.nan_to_num(second - first)
+    def at_middle_row(self, line_time_s: float, poses_at: PosesAt) -> Float[np.ndarray, "markers 4 2"]:
+        """(markers, 4, 2), pixels of the corners as the middle row's pose shows them."""
+        return self.corners_px - self.shift((0.0, line_time_s), poses_at)
 
+    def shift(self, line_times_s: tuple[float, float], poses_at: PosesAt) -> Float[np.ndarray, "markers 4 2"]:
+        """(markers, 4, 2), change of the pixels from one line time to another, seconds; 0 behind the camera."""
+        first, second = (self._seen_at(line_time_s, poses_at) for line_time_s in line_times_s)
+        return np.nan_to_num(second - first)
 
-def _seen_at(
-    time_s: Float[np.ndarray, "markers 4"],
-    corners_m: Float[np.ndarray, "markers 4 3"],
-    lens: Camera,
-    poses_at: PosesAt,
-) -> Float[np.ndarray, "markers 4 2"]:
-    """Pixels of corners, each at its own time; NaN behind the camera."""
-    position_m, R = poses_at(time_s.ravel())
-    x_cam = np.einsum("nji,nj->ni", R, corners_m.reshape(-1, 3) - position_m)
-    x_cam[x_cam[:, 2] <= NEAR_M] = np.nan
-    return np.asarray(to_pixels(lens, x_cam)).reshape(*time_s.shape, 2)
+    def _seen_at(self, line_time_s: float, poses_at: PosesAt) -> Float[np.ndarray, "markers 4 2"]:
+        """Pixels of the corners, each at the time of its row; NaN behind the camera."""
+        position_m, R = poses_at((self.time_s + self.late_s(line_time_s)).ravel())
+        x_cam = np.einsum("nji,nj->ni", R, self.corners_m.reshape(-1, 3) - position_m)
+        x_cam[x_cam[:, 2] <= NEAR_M] = np.nan
+        return np.asarray(to_pixels(self.lens, x_cam)).reshape(self.corners_px.shape)
 
 
 @dataclass(frozen=True)
@@ -267,25 +256,23 @@ def _followed(
         The motion by these poses, None if too few frames have one; and for each frame that is not at an end of the run,
         the weighted squares of the changes by the line time, and their products with the residuals.
     """
-    poses: list[tuple[float, MarkerPose, np.ndarray, np.ndarray]] = []
+    poses: list[tuple[SeenRows, MarkerPose]] = []
     for _, time_s, markers in run:
         corners_m = marker_map.corners_of(markers.ids.tolist())
-        corners_px = markers.corners_px
-        if motion is not None:
-            corners_px = at_middle_row(corners_px, corners_m, lens, line_time_s, time_s, motion)
+        rows = SeenRows(markers.corners_px, corners_m, lens, time_s)
+        corners_px = markers.corners_px if motion is None else rows.at_middle_row(line_time_s, motion)
         pose = estimate_pose(corners_px, corners_m, lens, settings, std_px=markers.std_px)
         if pose is not None and len(pose.used) == len(pose.fits):
-            poses.append((time_s, pose, markers.corners_px, corners_m))
+            poses.append((rows, pose))
     if len(poses) < _FEWEST_FRAMES:
         return None, np.zeros((0, 2))
     motion = spline_through(
-        [time_s for time_s, *_ in poses], [(pose.position_m, pose.R_world_cam) for _, pose, *_ in poses]
+        [rows.time_s for rows, _ in poses], [(pose.position_m, pose.R_world_cam) for _, pose in poses]
     )
     unit_s = 1e-3 / float(lens.image_size_wh[1])
     sums = []
-    for time_s, pose, corners_px, corners_m in poses[1:-1]:
-        around_s = line_time_s - unit_s / 2, line_time_s + unit_s / 2
-        change = shift_of_rows(corners_px, corners_m, lens, around_s, time_s, motion) / unit_s
+    for rows, pose in poses[1:-1]:
+        change = rows.shift((line_time_s - unit_s / 2, line_time_s + unit_s / 2), motion) / unit_s
         if pose.equations is not None:
             squares, products = pose.equations.products(change.reshape(-1, 8, 1))
             sums.append((squares[0, 0], products[0]))

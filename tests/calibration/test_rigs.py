@@ -26,6 +26,7 @@ from psotrack.calibration import (
     GivenWorld,
     LensChoice,
     LensModel,
+    LensViews,
     PointViews,
     advise,
     align,
@@ -114,7 +115,8 @@ def test_a_board_whose_first_corner_is_beside_a_wide_lens(turn_deg):
     assert 6 < (~hidden).sum() < len(hidden)
     places[hidden] = np.nan
     pixels = 300 * places[:, :2] / places[:, 2:] + (640, 360)
-    left_px = fit_boards(BOARD, LensModel(0), np.array([300.0, 300, 640, 360]), pixels[None], SIZE_WH)
+    views = LensViews(BOARD, pixels[None], SIZE_WH)
+    left_px = fit_boards(views, LensModel(0), np.array([300.0, 300, 640, 360]))
     assert (left_px[0, ~hidden] < 1e-6).all()
 
 

@@ -25,7 +25,7 @@ from psotrack.inside_out import (
 )
 from psotrack.inside_out.localising import localise_frames
 from psotrack.inside_out.mapping.sightings import collect_sightings
-from psotrack.inside_out.rolling_shutter import at_middle_row, estimate_line_time
+from psotrack.inside_out.rolling_shutter import SeenRows, estimate_line_time
 
 WIDTH, HEIGHT, FPS = 1280, 720, 30.0
 LINE_TIME_S = 0.020 / HEIGHT
@@ -123,7 +123,7 @@ def test_corners_are_moved_to_where_the_middle_row_sees_them():
     inside = ((still > 0) & (still < [WIDTH, HEIGHT])).all(axis=(1, 2)) & (depth_m > 0.3).all(axis=1)
     rolling, still = rolling[inside], still[inside]
     assert np.abs(rolling - still).max() > 1.0
-    moved = at_middle_row(rolling, POINTS_M[inside], LENS, LINE_TIME_S, 0.5, hand.at)
+    moved = SeenRows(rolling, POINTS_M[inside], LENS, 0.5).at_middle_row(LINE_TIME_S, hand.at)
     np.testing.assert_allclose(moved, still, atol=1e-6)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -289,26 +289,28 @@ def estimate_clocks(
     of_step = min(_LEAST_INSTANTS, len(points_px) // _STRETCHES_OF_STEP)
     is_long = of_step >= _LEAST_INSTANTS // 2
     while True:
-        stretches = searched = _offsets_of_stretches(rig, points_px, timeline, _LEAST_INSTANTS)
-        found = None
+        stretches = _offsets_of_stretches(rig, points_px, timeline, _LEAST_INSTANTS)
+        step = None
         if is_long and len(lost) < _MOST_STEPS:
-            if of_step < _LEAST_INSTANTS:
-                searched = _offsets_of_stretches(rig, points_px, timeline, of_step)
-            found = _lost_frames(rig, points_px, timeline, searched)
+            shorter = of_step < _LEAST_INSTANTS
+            step = _most_certain_step(
+                _offsets_of_stretches(rig, points_px, timeline, of_step) if shorter else stretches
+            )
+        found = None if step is None else _lost_frames(rig, points_px, timeline, step)
         if found is None:
             clocks = fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
             return replace(clocks, lost=tuple(lost))
-        row, frames = found
-        points_px = _as_exposed(points_px, timeline, frames.camera, row, frames.step_s)
+        instant, frames = found
+        points_px = _as_exposed(points_px, timeline, frames.camera, instant, frames.step_s)
         lost.append(frames)
 
 
-#: Middle of each stretch, offsets of the cameras in it and their standard deviations, seconds.
-_Stretches = tuple[
-    Float[np.ndarray, "stretches"],
-    Float[np.ndarray, "stretches cameras"],
-    Float[np.ndarray, "stretches cameras"],
-]
+class _Stretches(NamedTuple):
+    """Middle of each stretch, offsets of the cameras in it and their standard deviations, seconds."""
+
+    time_s: Float[np.ndarray, "stretches"]
+    offset_s: Float[np.ndarray, "stretches cameras"]
+    std_s: Float[np.ndarray, "stretches cameras"]
 
 
 def _offsets_of_stretches(
@@ -321,30 +323,36 @@ def _offsets_of_stretches(
         camera_offsets(rig, points_px[part], timeline.rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
         for part in parts
     ]
-    time_s = np.array([timeline.time_s[part].mean() for part in parts])
-    offset_s = np.array([one.offset_frames for one in estimates]) / timeline.rate_hz
-    ratio = np.array([one.std_frames / one.white_std_frames for one in estimates])
-    white_s = np.array([one.white_std_frames for one in estimates]) / timeline.rate_hz
-    shown = np.array([one.shown for one in estimates])
+    offset, std, white, shown = (
+        np.array([getattr(one, name) for one in estimates])
+        for name in ("offset_frames", "std_frames", "white_std_frames", "shown")
+    )
     # One stretch of one camera shows badly how far its errors are correlated: all tell it together.
-    larger = np.sqrt(max(float(np.mean(ratio[shown] ** 2)), 1.0)) if shown.any() else 1.0
-    std_s = np.where(shown, larger * white_s, np.inf)
-    return time_s, offset_s, std_s
+    larger = np.sqrt(max(float(np.mean((std / white)[shown] ** 2)), 1.0)) if shown.any() else 1.0
+    std_s = np.where(shown, larger * (white / timeline.rate_hz), np.inf)
+    time_s = np.array([timeline.time_s[part].mean() for part in parts])
+    return _Stretches(time_s, offset / timeline.rate_hz, std_s)
 
 
-def _lost_frames(
-    rig: Rig,
-    points_px: Float[np.ndarray, "instants drones cameras 2"],
-    timeline: Timeline,
-    stretches: _Stretches,
-) -> tuple[int, LostFrames] | None:
-    """The most certain step of a clock and its instant; None where no step fits better than even clocks.
+class _Step(NamedTuple):
+    """A camera whose clock is `jump_s` later from some stretch on; offsets of all cameras before it, seconds.
+
+    `scatter` is how much the offsets of the stretches are off a step there, in their standard deviations.
+    """
+
+    camera: int
+    before_s: Float[np.ndarray, "cameras"]
+    jump_s: float
+    scatter: float
+
+
+def _most_certain_step(stretches: _Stretches) -> _Step | None:
+    """The step of a clock that the stretches show best; None where no step fits better than even clocks.
 
     The stretch with the step has no offset of its own, so it is left out of both fits.
     """
     time_s, offset_s, std_s = stretches
-    number = np.arange(len(time_s))
-    best: tuple[float, int, Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]] | None = None
+    number, steps = np.arange(len(time_s)), list[_Step]()
     for middle in number[1:-1]:
         others_s = np.where((number == middle)[:, None], np.inf, std_s)
         step, line = (
@@ -352,47 +360,51 @@ def _lost_frames(
             for change in (number > middle, time_s - time_s.mean())
         )
         # Of two cameras, that which is later afterwards has lost frames.
-        jump_s = step[0][:, 1] - np.sort(step[0][:, 1])[(len(rig) - 1) // 2]
-        std_of_jump_s = np.sqrt(np.diag(step[1])[1::2])
-        certainty = np.divide(jump_s, std_of_jump_s, out=np.zeros(len(rig)), where=std_of_jump_s > 0)
+        jump_s = step.coefficients[:, 1] - np.sort(step.coefficients[:, 1])[(offset_s.shape[1] - 1) // 2]
+        certainty = np.divide(jump_s, step.slope_std, out=np.zeros(len(jump_s)), where=step.slope_std > 0)
         camera = int(certainty.argmax())
-        if step[2] < line[2] and certainty[camera] > _CLEARLY and (best is None or step[2] < best[0]):
-            best = step[2], camera, step[0][:, 0], jump_s
-    if best is None:
-        return None
-    _, camera, before_s, jump_s = best
+        if step.scatter < line.scatter and certainty[camera] > _CLEARLY:
+            steps.append(_Step(camera, step.coefficients[:, 0], float(jump_s[camera]), step.scatter))
+    return min(steps, key=lambda step: step.scatter, default=None)
+
+
+def _lost_frames(
+    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline, step: _Step
+) -> tuple[int, LostFrames] | None:
+    """The instant of a step, and the frames that were lost; None of a step that is no whole number of frames."""
+    camera, before_s = step.camera, step.before_s
     shown = np.flatnonzero(timeline.frame[:, camera] >= 0)
-    first, last = shown[0], shown[-1]
-    interval_s = float(np.ptp(timeline.time_s[[first, last]]) / np.ptp(timeline.frame[[first, last], camera]))
-    count = int(np.rint(jump_s[camera] / interval_s))
-    if count < 1 or abs(jump_s[camera] / interval_s - count) > _WHOLE:
+    ends = shown[[0, -1]]
+    interval_s = float(np.ptp(timeline.time_s[ends]) / np.ptp(timeline.frame[ends, camera]))
+    count = int(np.rint(step.jump_s / interval_s))
+    if count < 1 or abs(step.jump_s / interval_s - count) > _WHOLE:
         return None
     step_s = count * interval_s
     after_s = before_s + step_s * (np.arange(len(rig)) == camera)
     before, after = (misfits(rig.cameras, points_px, each * timeline.rate_hz) for each in (before_s, after_s))
     # Before about this instant the clock as it was fits better, from it on the one that is later.
-    row = int(np.append(0.0, np.cumsum(before - after)).argmin())
+    about = int(np.append(0.0, np.cumsum(before - after)).argmin())
 
-    def misfit(row: int) -> float:
-        moved_px = _as_exposed(points_px, timeline, camera, row, step_s)
+    def misfit(instant: int) -> float:
+        moved_px = _as_exposed(points_px, timeline, camera, instant, step_s)
         return float(misfits(rig.cameras, moved_px, before_s * timeline.rate_hz).sum())
 
     reach = 1 + round(step_s * timeline.rate_hz)
-    row = min(range(max(row - reach, 0), row + reach + 1), key=misfit)
-    row = int(shown[np.clip(np.searchsorted(shown, row), 0, len(shown) - 1)])
-    return row, LostFrames(camera, int(timeline.frame[row, camera]), count, step_s)
+    best = min(range(max(about - reach, 0), about + reach + 1), key=misfit)
+    instant = int(shown[np.clip(np.searchsorted(shown, best), 0, len(shown) - 1)])
+    return instant, LostFrames(camera, int(timeline.frame[instant, camera]), count, step_s)
 
 
 def _as_exposed(
     points_px: Float[np.ndarray, "instants drones cameras 2"],
     timeline: Timeline,
     camera: int,
-    row: int,
+    instant: int,
     step_s: float,
 ) -> Float[np.ndarray, "instants drones cameras 2"]:
     """The points at the instants if a camera's frames from an instant on were exposed later."""
     moved_px, time_s = points_px.copy(), timeline.time_s.copy()
-    time_s[row:] += step_s
+    time_s[instant:] += step_s
     # Interpolated over the lost frames, too: a wrong instant must not drop the place that shows that it is wrong.
     at = interpolated(time_s, points_px[:, :, camera], step_s + _MAX_GAP / timeline.rate_hz)
     moved_px[:, :, camera] = at(timeline.time_s)
@@ -416,33 +428,46 @@ def fit_clocks(
     """
     num_stretches, num_cameras = offset_s.shape
     middle_s = float(time_s.mean())
-    fitted_s, covariance_s2, _ = _fit(np.ones((num_stretches, 1)), offset_s, std_s)
+    even = np.ones(num_stretches)
+    used = _fit(even[:, None], offset_s, std_s)
     drift, drift_std = np.zeros(num_cameras), np.full(num_cameras, np.inf)
     if num_stretches >= 3:
-        both, covariance, _ = _fit(
-            np.stack([np.ones(num_stretches), time_s - middle_s], axis=-1), offset_s, std_s
-        )
-        found = both[:, 1] - np.median(both[:, 1])
-        drift_std = np.sqrt(np.diag(covariance)[1::2])
+        line = _fit(np.stack([even, time_s - middle_s], axis=-1), offset_s, std_s)
+        found, drift_std = line.coefficients[:, 1] - np.median(line.coefficients[:, 1]), line.slope_std
         if (np.abs(found) > _CLEARLY * drift_std).any():
-            drift, fitted_s, covariance_s2 = found, both[:, :1], covariance[::2, ::2]
+            drift, used = found, line
     seen = np.isfinite(std_s).any(axis=0)
-    offset_std_s = np.where(seen, np.sqrt(np.diag(covariance_s2)), np.inf)
-    known = offset_std_s < known_s
+    offset_std_s = np.where(seen, used.offset_std, np.inf)
+    known, fitted_s = offset_std_s < known_s, used.coefficients[:, 0]
     zero_s = float(np.median(fitted_s[known])) if known.any() else 0.0
-    offset_s = np.where(known, fitted_s[:, 0] - zero_s, 0.0)
+    offset_s = np.where(known, fitted_s - zero_s, 0.0)
     return CameraClocks(offset_s, offset_std_s, np.where(known, drift, 0.0), drift_std, middle_s, known)
+
+
+class _Fit(NamedTuple):
+    """Coefficients of each camera, relative to the mean of all, their covariance, and the scatter about them."""
+
+    coefficients: Float[np.ndarray, "cameras terms"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    scatter: float
+
+    @property
+    def offset_std(self) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), standard deviations of the first coefficients."""
+        return np.sqrt(np.diag(self.covariance)[:: self.coefficients.shape[1]])
+
+    @property
+    def slope_std(self) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), standard deviations of the second coefficients of two."""
+        return np.sqrt(np.diag(self.covariance)[1::2])
 
 
 def _fit(
     basis: Float[np.ndarray, "stretches terms"],
     offset_s: Float[np.ndarray, "stretches cameras"],
     std_s: Float[np.ndarray, "stretches cameras"],
-) -> tuple[Float[np.ndarray, "cameras terms"], Float[np.ndarray, "unknowns unknowns"], float]:
-    """Coefficients of each camera, relative to the mean of all cameras, their covariance, and the scatter about them.
-
-    Where the offsets scatter more than their standard deviations say, the covariance is larger accordingly.
-    """
+) -> _Fit:
+    """Weighted least squares; where the offsets scatter more than their errors say, the covariance is larger."""
     (num_stretches, terms), num_cameras = basis.shape, offset_s.shape[1]
     unknowns = num_cameras * terms
     weight = 1 / np.maximum(std_s, 1e-9).ravel()
@@ -463,4 +488,4 @@ def _fit(
     share = known / known.sum() if known.any() else np.full(num_cameras, 1 / num_cameras)
     centred = np.kron(np.eye(num_cameras) - share, np.eye(terms))
     coefficients = solution[:unknowns].reshape(num_cameras, terms)
-    return coefficients - share @ coefficients, centred @ covariance @ centred.T, scatter
+    return _Fit(coefficients - share @ coefficients, centred @ covariance @ centred.T, scatter)

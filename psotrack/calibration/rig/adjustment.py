@@ -42,6 +42,7 @@ from psotrack.calibration.rig.start import (
     LEAST_VIEWS,
     MOST_FITS,
     Chain,
+    LensViews,
     choose_lens_model,
     find_lens,
     join_cameras,
@@ -214,17 +215,17 @@ def _first_lens(
     board: Board, views: BoardViews, camera: int, model: LensModel | None, advance: Advance
 ) -> tuple[LensModel, Float[np.ndarray, " unknowns"]]:
     """Model and first vector of a camera's lens from its own views; None for a model that the views choose."""
-    size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
-    views_px = views.corners_px[camera][views.seen[camera]]
+    width, height = views.image_size_wh[camera].tolist()
+    own = LensViews(board, views.corners_px[camera][views.seen[camera]], (width, height))
     if model is None:
-        if len(views_px) < LEAST_VIEWS:
+        if len(own) < LEAST_VIEWS:
             _logger.warning(
                 "camera %s: lens models are compared by at least %d views, found %d: it gets the usual model; film "
                 "more views, or choose a model by --lens",
-                *(views.names[camera], LEAST_VIEWS, len(views_px)),
+                *(views.names[camera], LEAST_VIEWS, len(own)),
             )
-        model = choose_lens_model(board, views_px, size_wh, advance)
-    vector = find_lens(board, model, views_px, size_wh)
+        model = choose_lens_model(own, advance)
+    vector = find_lens(own, model)
     if vector is None:
         raise InputError(
             f"camera {views.names[camera]}",

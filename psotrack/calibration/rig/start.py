@@ -71,33 +71,49 @@ def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Floa
     return np.array([T for _, T in found]).reshape(-1, 4, 4)
 
 
+@dataclass(frozen=True)
+class LensViews:
+    """Views of a board by one camera.
+
+    Attributes:
+        board: the board.
+        corners_px: (views, corners, 2), pixels; NaN where a corner is not seen.
+        image_size_wh: width and height of the images, pixels.
+    """
+
+    board: Board
+    corners_px: Float[np.ndarray, "views corners 2"]
+    image_size_wh: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.corners_px)
+
+    def select(self, chosen: np.ndarray | slice) -> LensViews:
+        """Chosen views."""
+        return replace(self, corners_px=self.corners_px[chosen])
+
+
 def find_lens(
-    board: Board,
-    model: LensModel,
-    views_px: Float[np.ndarray, "instants corners 2"],
-    image_size_wh: tuple[int, int],
-    focal_px: float | None = None,
+    views: LensViews, model: LensModel, focal_px: float | None = None
 ) -> Float[np.ndarray, " unknowns"] | None:
     """Find a first lens of one camera from its views of a board: an adjustment from several focal lengths.
 
     Args:
-        board: the board.
+        views: the views.
         model: model of the lens.
-        views_px: pixels of the board's corners; NaN where a corner is not seen.
-        image_size_wh: width and height of the images, pixels.
         focal_px: the only focal length from which the search starts, pixels, where it is known roughly.
 
     Returns:
         Vector of the lens, or None if no view fits.
     """
-    usable = views_px[np.isfinite(views_px[..., 0]).sum(axis=1) >= board.least_corners]
-    chosen = usable[np.linspace(0, len(usable) - 1, min(len(usable), _MOST_VIEWS)).round().astype(np.int64)]
+    usable = np.flatnonzero(np.isfinite(views.corners_px[..., 0]).sum(axis=1) >= views.board.least_corners)
+    spread = np.linspace(0, len(usable) - 1, min(len(usable), _MOST_VIEWS)).round().astype(np.int64)
+    chosen = views.select(usable[spread])
     found: list[tuple[float, np.ndarray]] = []
-    starts_px = [
-        widths * image_size_wh[0] for widths in (_FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS)
-    ]
-    for start_px in starts_px if focal_px is None else [focal_px]:
-        bundle = _adjust_lens(board, model, chosen, model.start(start_px, image_size_wh), image_size_wh)
+    widths = _FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS
+    starts_px = [width * views.image_size_wh[0] for width in widths] if focal_px is None else [focal_px]
+    for start_px in starts_px:
+        bundle = _adjust_lens(chosen, model, model.start(start_px, views.image_size_wh))
         if bundle is not None:
             cost = float(np.nansum(np.minimum(bundle.distance_px, 20.0)))
             found.append((cost, bundle.state.lenses[0]))
@@ -105,108 +121,80 @@ def find_lens(
 
 
 def fit_boards(
-    board: Board,
-    model: LensModel,
-    lens: Float[np.ndarray, " unknowns"],
-    views_px: Float[np.ndarray, "views corners 2"],
-    image_size_wh: tuple[int, int],
+    views: LensViews, model: LensModel, lens: Float[np.ndarray, " unknowns"]
 ) -> Float[np.ndarray, "views corners"] | None:
     """Fit the board's pose to each view with a known lens.
 
     Returns:
         Distances of the corners, pixels; NaN in views that the lens cannot show. None if there is no other view.
     """
-    prepared = _problem(board, model, lens, views_px, image_size_wh)
+    prepared = _problem(views, model, lens)
     if prepared is None:
         return None
     bundle, fits = prepared
-    bundle = solve_robustly(bundle)
-    distance_px = np.full(views_px.shape[:2], np.nan)
-    distance_px[fits] = bundle.distance_px
+    distance_px = np.full(views.corners_px.shape[:2], np.nan)
+    distance_px[fits] = solve_robustly(bundle).distance_px
     return distance_px
 
 
-def _adjust_lens(
-    board: Board,
-    model: LensModel,
-    views_px: Float[np.ndarray, "instants corners 2"],
-    lens: Float[np.ndarray, " unknowns"],
-    image_size_wh: tuple[int, int],
-) -> Bundle | None:
+def _adjust_lens(views: LensViews, model: LensModel, lens: Float[np.ndarray, " unknowns"]) -> Bundle | None:
     """Adjust a lens and the board's poses: first the focal lengths and the first coefficient, then all."""
-    prepared = _problem(board, model, lens, views_px, image_size_wh)
+    prepared = _problem(views, model, lens)
     if prepared is None:
         return None
-    bundle = prepared[0]
-    first = np.zeros(model.size, bool)
-    first[:2] = True
-    first[PINHOLE : PINHOLE + 1] = True
+    bundle, number = prepared[0], np.arange(model.size)
     try:
-        bundle = replace(bundle, problem=replace(bundle.problem, free_lens=(first,)))
-        bundle = solve_robustly(bundle, rounds=2)
-        return solve_robustly(
-            replace(bundle, problem=replace(bundle.problem, free_lens=(np.ones(model.size, bool),)))
-        )
+        for free, rounds in ((np.isin(number, (0, 1, PINHOLE)), 2), (number >= 0, 3)):
+            problem = replace(bundle.problem, free_lens=(free,))
+            bundle = solve_robustly(replace(bundle, problem=problem), rounds)
     except np.linalg.LinAlgError:
         return None
+    return bundle
 
 
 def _problem(
-    board: Board,
-    model: LensModel,
-    lens: Float[np.ndarray, " unknowns"],
-    views_px: Float[np.ndarray, "instants corners 2"],
-    image_size_wh: tuple[int, int],
-) -> tuple[Bundle, Bool[np.ndarray, " instants"]] | None:
+    views: LensViews, model: LensModel, lens: Float[np.ndarray, " unknowns"]
+) -> tuple[Bundle, Bool[np.ndarray, " views"]] | None:
     """Adjustment of one lens, and the views that it can show; None if it can show none."""
+    views_px = views.corners_px
     rays = model.normalise(lens, views_px.reshape(-1, 2)).reshape(views_px.shape)
-    poses = [find_board_poses(board, of_view) for of_view in rays]
+    poses = [find_board_poses(views.board, of_view) for of_view in rays]
     fits = np.array([len(candidates) > 0 for candidates in poses])
     if not fits.any():
         return None
     boards = np.array([candidates[0] for candidates in poses if len(candidates)])
     state = BundleState((lens,), np.eye(4)[None], boards, np.ones(len(boards)))
     free = np.zeros(1, bool), np.ones(len(boards), bool)
-    bundle = Bundle.of_views((model,), state, board.corners_m, views_px[None, fits], free=free)
-    problem = replace(bundle.problem, priors=(model.prior(image_size_wh),))
+    bundle = Bundle.of_views((model,), state, views.board.corners_m, views_px[None, fits], free=free)
+    problem = replace(bundle.problem, priors=(model.prior(views.image_size_wh),))
     return replace(bundle, problem=problem), fits
 
 
-def choose_lens_model(
-    board: Board,
-    views_px: Float[np.ndarray, "views corners 2"],
-    image_size_wh: tuple[int, int],
-    advance: Advance = lambda steps: None,
-) -> LensModel:
+def choose_lens_model(views: LensViews, advance: Advance = lambda steps: None) -> LensModel:
     """Choose the model of a lens by views that were left out.
 
     Args:
-        board: the board.
-        views_px: pixels of its corners; NaN where a corner is not seen.
-        image_size_wh: width and height of the images, pixels.
+        views: the views.
         advance: called with 1 after each of at most `MOST_FITS` fits.
     """
-    views_px = views_px[:: -(-len(views_px) // _MOST_COMPARED)] if len(views_px) else views_px
-    if len(views_px) < LEAST_VIEWS:
+    views = views.select(slice(None, None, max(1, -(-len(views) // _MOST_COMPARED))))
+    if len(views) < LEAST_VIEWS:
         return _MODELS[0]
-    distances: dict[LensModel, np.ndarray | None] = {}
+    known: dict[LensModel, np.ndarray] = {}
     focal_px: float | None = None
     for model in _MODELS:
         # OpenCV's pinhole models have nearly the same focal length; a fisheye's is another.
-        start_px = None if model.fisheye else focal_px
-        distances[model], found_px = _left_out(board, model, views_px, image_size_wh, start_px, advance)
+        left_px, found_px = _left_out(views, model, None if model.fisheye else focal_px, advance)
+        if left_px is not None:
+            known[model] = left_px
         if not model.fisheye:
             focal_px = found_px
-    known = {model: of_model for model, of_model in distances.items() if of_model is not None}
     if not known:
         return _MODELS[0]
     # The width of the loss is the same for all models.
-    width = min(float(np.nanmedian(of_model)) for of_model in known.values())
-    losses = {
-        model: np.nanmean(np.log1p((of_model / max(width, 1e-6)) ** 2), axis=1)
-        for model, of_model in known.items()
-    }
-    error_px = {model: float(np.nanmedian(of_model)) for model, of_model in known.items()}
+    error_px = {model: float(np.nanmedian(left_px)) for model, left_px in known.items()}
+    width = max(min(error_px.values()), 1e-6)
+    losses = {model: np.nanmean(np.log1p((left_px / width) ** 2), axis=1) for model, left_px in known.items()}
     chosen = next(iter(known))
     for model in known:
         gain = losses[chosen] - losses[model]
@@ -217,32 +205,25 @@ def choose_lens_model(
 
 
 def _left_out(
-    board: Board,
-    model: LensModel,
-    views_px: Float[np.ndarray, "views corners 2"],
-    image_size_wh: tuple[int, int],
-    focal_px: float | None,
-    advance: Advance,
+    views: LensViews, model: LensModel, focal_px: float | None, advance: Advance
 ) -> tuple[Float[np.ndarray, "views corners"] | None, float | None]:
     """Distances of the corners from the projections by lenses of other views, pixels; None if a fit fails.
 
     Also the focal length, pixels; `focal_px` is where the first search starts, None for several focal lengths.
     """
-    distance_px = np.full(views_px.shape[:2], np.nan)
-    part = np.arange(len(views_px)) % _FOLDS
+    distance_px = np.full(views.corners_px.shape[:2], np.nan)
+    part = np.arange(len(views)) % _FOLDS
     for fold in range(_FOLDS):
-        lens = find_lens(board, model, views_px[part != fold], image_size_wh, focal_px)
-        found = (
-            None if lens is None else fit_boards(board, model, lens, views_px[part == fold], image_size_wh)
-        )
+        lens = find_lens(views.select(part != fold), model, focal_px)
+        found = None if lens is None else fit_boards(views.select(part == fold), model, lens)
         advance(1)
         if lens is None or found is None:
             return None, focal_px
         focal_px = float(lens[0])
         distance_px[part == fold] = found
     # A view that the lens cannot show at all is a bad view of this model, not a missing one.
-    seen = np.isfinite(views_px[..., 0])
-    return np.where(seen, np.nan_to_num(distance_px, nan=float(image_size_wh[0])), np.nan), focal_px
+    seen = np.isfinite(views.corners_px[..., 0])
+    return np.where(seen, np.nan_to_num(distance_px, nan=float(views.image_size_wh[0])), np.nan), focal_px
 
 
 @dataclass(frozen=True)

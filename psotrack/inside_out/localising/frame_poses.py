@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -36,9 +37,7 @@ from psotrack.inside_out.rolling_shutter import (
     LineTime,
     PosesAt,
     RollingShutter,
-    at_middle_row,
-    row_times_s,
-    shift_of_rows,
+    SeenRows,
 )
 from psotrack.trajectories import Status
 
@@ -146,62 +145,109 @@ class FollowedFrame:
     estimated: Estimated = field(default_factory=Estimated)
 
 
-def follow(
-    detected: Iterable[Detected],
-    marker_map: MarkerMap,
-    lens: Camera,
-    settings: LocaliseSettings,
-    agility: Agility | None,
-    around: Callable[[float], MotionAround | None] | None = None,
-    seconds: dict[str, float] | None = None,
-) -> Iterator[FollowedFrame]:
-    """Each frame's own pose and the filter's estimate, frame by frame.
+@dataclass(frozen=True)
+class Localiser:
+    """What a camera is localised by in frames whose markers are detected.
 
-    Args:
-        detected: number and time (seconds) of each frame, and its markers, which are all in the map.
+    Attributes:
         marker_map: map of the room.
         lens: intrinsics of the camera.
         settings: settings; the dictionary is not used.
-        agility: how wildly the camera moves; None of a stream, where it is chosen as poses come.
-        around: motion around a frame by its time; None takes it from the filter.
         seconds: times by stage; the times of "locate" and "filter" are added.
     """
-    spent_s = {"locate": 0.0, "filter": 0.0} if seconds is None else seconds
-    shutter, params = settings.shutter or RollingShutter(0.0), settings.filter or PoseFilterParams()
-    rolls = bool(shutter.line_time_s or shutter.std_s)
-    model, run, recent = agility or Agility(), FilterRun(), list[tuple[float, CameraPose]]()
-    for number, time_s, markers in detected:
-        began_s = time.perf_counter()
-        predicted = expected(run, time_s, params, model).motion
-        predicted_s = time.perf_counter()
-        corners_m = marker_map.corners_of(markers.ids.tolist())
-        motion = around(time_s) if around is not None else _constant(predicted, time_s)
-        for turn in range(_TURNS if rolls and around is None else 1):
-            moved = markers
-            if rolls and motion is not None:
-                corners_px = at_middle_row(
-                    markers.corners_px, corners_m, lens, shutter.line_time_s, time_s, motion.poses_at
-                )
-                moved = replace(markers, corners_px=corners_px)
-            pose = _own_pose(moved, corners_m, marker_map, lens, settings, predicted)
-            if rolls and pose is not None:
-                pose = _with_rows(pose, markers, corners_m, lens, shutter, time_s, motion)
-                if turn < _TURNS - 1 and around is None:
-                    trial = _stepped(run, time_s, pose, params, model)
-                    now = expected(trial, time_s, params, model)
-                    motion = _constant(now.motion, time_s) or motion
-        located_s = time.perf_counter()
-        run = _stepped(run, time_s, pose, params, model)
-        if agility is None and pose is not None and len(recent) < _CHOICES[-1]:
-            recent.append((time_s, pose))
-            if len(recent) in _CHOICES:
-                times_s, poses = zip(*recent, strict=True)
-                model, run = choose_agility(times_s, poses, params), FilterRun()
-                for earlier_s, earlier in recent:
-                    run = _stepped(run, earlier_s, earlier, params, model)
-        spent_s["locate"] += located_s - predicted_s
-        spent_s["filter"] += time.perf_counter() - located_s + predicted_s - began_s
-        yield FollowedFrame(number, time_s, len(markers), pose, expected(run, time_s, params, model))
+
+    marker_map: MarkerMap
+    lens: Camera
+    settings: LocaliseSettings
+    seconds: dict[str, float] = field(default_factory=lambda: {"locate": 0.0, "filter": 0.0})
+
+    @property
+    def shutter(self) -> RollingShutter:
+        """The shutter; a global one where it is not known."""
+        return self.settings.shutter or RollingShutter(0.0)
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the shutter rolls, or may roll."""
+        return bool(self.shutter.line_time_s or self.shutter.std_s)
+
+    @property
+    def params(self) -> PoseFilterParams:
+        """Parameters of the filter; those by default where there is none."""
+        return self.settings.filter or PoseFilterParams()
+
+    def with_pose(self, **changes: Any) -> Localiser:
+        """The same with other settings of pose estimation."""
+        pose = replace(self.settings.pose, **changes)
+        return replace(self, settings=replace(self.settings, pose=pose))
+
+    def follow(
+        self,
+        detected: Iterable[Detected],
+        agility: Agility | None,
+        around: Callable[[float], MotionAround | None] | None = None,
+    ) -> Iterator[FollowedFrame]:
+        """Each frame's own pose and the filter's estimate, frame by frame.
+
+        Args:
+            detected: number and time (seconds) of each frame, and its markers, which are all in the map.
+            agility: how wildly the camera moves; None of a stream, where it is chosen as poses come.
+            around: motion around a frame by its time; None takes it from the filter.
+        """
+        shutter, params, rolls = self.shutter, self.params, self.rolls
+        model, run, recent = agility or Agility(), FilterRun(), list[tuple[float, CameraPose]]()
+        for number, time_s, markers in detected:
+            began_s = time.perf_counter()
+            predicted = expected(run, time_s, params, model).motion
+            predicted_s = time.perf_counter()
+            corners_m = self.marker_map.corners_of(markers.ids.tolist())
+            rows = SeenRows(markers.corners_px, corners_m, self.lens, time_s)
+            motion = around(time_s) if around is not None else _constant(predicted, time_s)
+            for turn in range(_TURNS if rolls and around is None else 1):
+                moved = markers
+                if rolls and motion is not None:
+                    corners_px = rows.at_middle_row(shutter.line_time_s, motion.poses_at)
+                    moved = replace(markers, corners_px=corners_px)
+                pose = self._own_pose(moved, corners_m, predicted)
+                if rolls and pose is not None:
+                    pose = _with_rows(pose, rows, shutter, motion)
+                    if turn < _TURNS - 1 and around is None:
+                        trial = _stepped(run, time_s, pose, params, model)
+                        now = expected(trial, time_s, params, model)
+                        motion = _constant(now.motion, time_s) or motion
+            located_s = time.perf_counter()
+            run = _stepped(run, time_s, pose, params, model)
+            if agility is None and pose is not None and len(recent) < _CHOICES[-1]:
+                recent.append((time_s, pose))
+                if len(recent) in _CHOICES:
+                    times_s, poses = zip(*recent, strict=True)
+                    model, run = choose_agility(times_s, poses, params), FilterRun()
+                    for earlier_s, earlier in recent:
+                        run = _stepped(run, earlier_s, earlier, params, model)
+            self.seconds["locate"] += located_s - predicted_s
+            self.seconds["filter"] += time.perf_counter() - located_s + predicted_s - began_s
+            yield FollowedFrame(number, time_s, len(markers), pose, expected(run, time_s, params, model))
+
+    def _own_pose(
+        self,
+        markers: DetectedMarkers,
+        corners_m: Float[np.ndarray, "markers 4 3"],
+        predicted: MotionEstimate | None,
+    ) -> MarkerPose | None:
+        """The pose by a frame's markers; the filter's prediction decides between poses that fit about equally well."""
+        try:
+            return estimate_pose(
+                markers.corners_px,
+                corners_m,
+                self.lens,
+                self.settings.pose,
+                None if self.settings.filter is None else predicted,
+                std_px=markers.std_px,
+                map_std_m=self.marker_map.std_of(markers.ids.tolist()),
+            )
+        except np.linalg.LinAlgError:
+            # Corners of a wrong map may determine no pose at all; the frame is lost, the others are not.
+            return None
 
 
 def _stepped(
@@ -212,32 +258,6 @@ def _stepped(
     except np.linalg.LinAlgError:
         # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
         return FilterRun()
-
-
-def _own_pose(
-    markers: DetectedMarkers,
-    corners_m: Float[np.ndarray, "markers 4 3"],
-    marker_map: MarkerMap,
-    lens: Camera,
-    settings: LocaliseSettings,
-    predicted: MotionEstimate | None,
-) -> MarkerPose | None:
-    """The pose by one frame's markers; the filter's prediction decides between poses that fit about equally well."""
-    prior = None if settings.filter is None else predicted
-    map_std_m = marker_map.std_of(markers.ids.tolist())
-    try:
-        return estimate_pose(
-            markers.corners_px,
-            corners_m,
-            lens,
-            settings.pose,
-            prior,
-            std_px=markers.std_px,
-            map_std_m=map_std_m,
-        )
-    except np.linalg.LinAlgError:
-        # Corners of a wrong map may determine no pose at all; the frame is lost, the others are not.
-        return None
 
 
 def own_path(frames: Sequence[FollowedFrame], settings: PoseSettings) -> CameraPath:
@@ -282,26 +302,20 @@ def constant_motion(predicted: MotionEstimate, time_s: float) -> PosesAt:
 
 
 def _with_rows(
-    pose: MarkerPose,
-    markers: DetectedMarkers,
-    corners_m: Float[np.ndarray, "markers 4 3"],
-    lens: Camera,
-    shutter: RollingShutter,
-    time_s: float,
-    motion: MotionAround | None,
+    pose: MarkerPose, rows: SeenRows, shutter: RollingShutter, motion: MotionAround | None
 ) -> MarkerPose:
     """A pose whose rows show the motion during the frame as well, with covariances by it and by the line time.
 
     The motion is that around the frame and a change, whose six numbers are unknowns with a prior.
     """
-    equations, corners_px = pose.equations, markers.corners_px
-    if equations is None or len(equations.fits) < len(corners_px):
+    equations = pose.equations
+    if equations is None or len(equations.fits) < len(rows.corners_px):
         return pose
     gain = equations.gain()
     root = np.diag(_UNKNOWN_RATES) if motion is None else motion.rate_root
 
     def by_rates(line_time_s: float) -> Float[np.ndarray, "markers 8 6"]:
-        late_s = np.repeat(row_times_s(corners_px, lens, line_time_s), 2, axis=1)[..., None]
+        late_s = np.repeat(rows.late_s(line_time_s), 2, axis=1)[..., None]
         return late_s * equations.slopes[..., :6] @ root
 
     by_motion = by_rates(shutter.line_time_s)
@@ -311,7 +325,7 @@ def _with_rows(
     by_line_time = by_rates(shutter.std_s).reshape(-1, 6)
     if motion is not None and shutter.std_s:
         line_times_s = shutter.line_time_s, shutter.line_time_s + shutter.std_s
-        shift_px = shift_of_rows(corners_px, corners_m, lens, line_times_s, time_s, motion.poses_at)
+        shift_px = rows.shift(line_times_s, motion.poses_at)
         by_line_time = np.column_stack([by_line_time, shift_px.ravel()])
     constant = (gain @ by_line_time) @ (gain @ by_line_time).T
     return replace(

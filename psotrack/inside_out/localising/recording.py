@@ -35,16 +35,16 @@ from psotrack.inside_out.localising.frame_poses import (
     STAGES,
     FollowedFrame,
     LocalisedVideo,
+    Localiser,
     LocaliseSettings,
     MotionAround,
     constant_motion,
-    follow,
     own_path,
 )
 from psotrack.inside_out.mapping.building import complete_map
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.inside_out.pose import CornerNoise, estimate_noise
-from psotrack.inside_out.rolling_shutter import Detected, RollingShutter, estimate_line_time, spline_through
+from psotrack.inside_out.rolling_shutter import Detected, estimate_line_time, spline_through
 from psotrack.support import Advance, Report, no_progress
 
 #: Largest number of frames from which the errors of corners are learned, and number of estimates.
@@ -82,77 +82,74 @@ def localise_frames(
         settings: settings; the dictionary is not used.
         seconds: times by stage; the times of "locate" and "filter" are added.
     """
+    localiser = Localiser(marker_map, lens, settings)
+    if seconds is not None:
+        localiser = replace(localiser, seconds=seconds)
     if not isinstance(detected, Sequence):
         shown, interrupted = list[FollowedFrame](), False
         try:
-            shown.extend(follow(detected, marker_map, lens, settings, None, None, seconds))
+            shown.extend(localiser.follow(detected, None))
         except KeyboardInterrupt:
             # A recording can be localised again, a stream cannot: the frames of a stream are kept.
             if not shown:
                 raise
             interrupted = True
-        return replace(_localised(shown, marker_map, settings), interrupted=interrupted)
+        return replace(_localised(shown, localiser), interrupted=interrupted)
     if settings.filter is not None:
         settings = replace(settings, filter=settings.filter.within(len(detected)))
-    localised, found = _recording(detected, marker_map, lens, settings, seconds)
+        localiser = replace(localiser, settings=settings)
+    localised, found = _recording(detected, localiser)
     wrong: tuple[int, ...] = ()
-    given = detected
+    given, fewest = detected, settings.pose.min_markers
     while more := _wrong_markers(detected, found):
         wrong = tuple(sorted((*wrong, *more)))
         if 2 * len(wrong) > len({int(marker) for _, _, markers in given for marker in markers.ids}):
             # Most markers are wrong: nothing says which ones are, or the lens is wrong.
             break
-        fewest = settings.pose.min_markers
         detected = [
             (number, time_s, markers.select(~np.isin(markers.ids, wrong) & (len(markers) >= fewest)))
             for number, time_s, markers in given
         ]
-        least = replace(settings, pose=replace(settings.pose, min_markers=min(fewest, _ENOUGH)))
-        localised, found = _recording(detected, marker_map, lens, least, seconds)
+        localised, found = _recording(detected, localiser.with_pose(min_markers=min(fewest, _ENOUGH)))
     return replace(localised, wrong_markers=wrong)
 
 
 def _recording(
-    detected: Sequence[Detected],
-    marker_map: MarkerMap,
-    lens: Camera,
-    settings: LocaliseSettings,
-    seconds: dict[str, float] | None,
+    detected: Sequence[Detected], localiser: Localiser
 ) -> tuple[LocalisedVideo, list[FollowedFrame]]:
     """Localise a recording with all its markers."""
-    line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
+    settings = localiser.settings
+    line_time = estimate_line_time(detected, localiser.marker_map, localiser.lens, settings.pose)
     if line_time is not None:
         settings = replace(settings, shutter=line_time.shutter(settings.shutter))
-    shutter = settings.shutter or RollingShutter(0.0)
-    params, agility, around = settings.filter or PoseFilterParams(), Agility(), None
-    for _ in range(_ROLLING_TURNS if shutter.line_time_s or shutter.std_s else 0):
-        found = list(follow(detected, marker_map, lens, settings, agility, around, seconds))
-        around = _motions_around(found, params)
+        localiser = replace(localiser, settings=settings)
+    agility, around = Agility(), None
+    for _ in range(_ROLLING_TURNS if localiser.rolls else 0):
+        around = _motions_around(list(localiser.follow(detected, agility, around)), localiser.params)
     if settings.pose.noise is None:
         noise = CornerNoise()
         several = [one for one in detected if len(one[2]) >= max(2, settings.pose.min_markers)]
         chosen = np.unique(np.linspace(0, len(several) - 1, min(_NOISE_FRAMES, len(several))).astype(int))
         some = [several[index] for index in chosen]
+        single = replace(localiser, settings=replace(settings, filter=None))
         for _ in range(_NOISE_TURNS):
-            known = replace(settings, pose=replace(settings.pose, noise=noise))
-            shown = follow(some, marker_map, lens, replace(known, filter=None), agility, around, seconds)
+            shown = single.with_pose(noise=noise).follow(some, agility, around)
             poses = [frame.pose for frame in shown if frame.pose is not None]
             noise = estimate_noise([pose.equations for pose in poses if pose.equations is not None], noise)
-        settings = replace(settings, pose=replace(settings.pose, noise=noise))
-    found = list(follow(detected, marker_map, lens, settings, agility, around, seconds))
-    return replace(_localised(found, marker_map, settings, anew=True), line_time=line_time), found
+        localiser = localiser.with_pose(noise=noise)
+    found = list(localiser.follow(detected, agility, around))
+    return replace(_localised(found, localiser, anew=True), line_time=line_time), found
 
 
-def _localised(
-    found: Sequence[FollowedFrame], marker_map: MarkerMap, settings: LocaliseSettings, *, anew: bool = False
-) -> LocalisedVideo:
+def _localised(found: Sequence[FollowedFrame], localiser: Localiser, *, anew: bool = False) -> LocalisedVideo:
     """The paths of frames; filtered anew with the agility of all frames, or as they were estimated."""
+    settings = localiser.settings
     path = raw = own_path(found, settings.pose)
     constant = np.nan_to_num(filled([frame.pose for frame in found], "constant", 6, 6))
     if settings.filter is not None:
         estimated = [frame.estimated for frame in found]
         path = filter_path(raw, settings.filter, constant) if anew else path_of(raw, estimated)
-    return LocalisedVideo(path, raw, constant, settings.shutter or RollingShutter(0.0), marker_map)
+    return LocalisedVideo(path, raw, constant, localiser.shutter, localiser.marker_map)
 
 
 def _motions_around(
