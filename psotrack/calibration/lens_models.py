@@ -67,6 +67,7 @@ class LensModel:
 
     def start(self, focal_px: float, image_size_wh: tuple[int, int]) -> Float[np.ndarray, " unknowns"]:
         """A lens without distortion whose principal point is the image's middle."""
+        # Pixel centres are at whole numbers.
         middle = (np.array(image_size_wh) - 1) / 2
         return np.concatenate([[focal_px, focal_px], middle, np.zeros(self.coefficients)])
 
@@ -210,8 +211,7 @@ def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tupl
         raise SettingsError(
             "field of view", expected="angles between 0 and 180 degrees", found=f"{angles_deg.tolist()}"
         )
-    focal_length_px = np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2)
-    # Pixel centres are at whole numbers, so the middle of the image is (size - 1) / 2.
-    cx, cy = (np.array(image_size_wh) - 1) / 2
-    K = np.array([[focal_length_px[0], 0.0, cx], [0.0, focal_length_px[1], cy], [0.0, 0.0, 1.0]])
-    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
+    model = LensModel(0)
+    lens = model.start(0.0, image_size_wh)
+    lens[:2] = np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2)
+    return model.camera(lens, np.eye(4), image_size_wh)

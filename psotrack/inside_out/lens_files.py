@@ -31,47 +31,25 @@ def choose_lens(
     name: str | None = None,
     scale: bool = False,
 ) -> Camera:
-    """The lens from a calibration file (see `read_lens`) or from fields of view, whichever is given.
+    """The lens of one camera, for images of a given size, from a calibration file or from fields of view.
 
     Args:
         image_size_wh: width and height of the images in pixels.
-        path: calibration file; None if fields of view are given.
+        path: calibration file: any that `read_lenses` reads, or the dataset's `drone_cameras_calibration.csv`; None if
+            fields of view are given.
         fov_deg: horizontal and vertical field of view, degrees; None if a file is given.
-        name: name of the camera in the file.
-        scale: scale a lens for a larger or smaller form of the same images, as in `read_lens`.
-
-    Raises:
-        InputError: see `read_lens`.
-        SettingsError: both are given, or neither, or angles that no lens has.
-    """
-    if (path is None) == (fov_deg is None):
-        found = "neither" if path is None else "both"
-        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found=found)
-    if fov_deg is not None:
-        return lens_of_view(*fov_deg, image_size_wh)
-    assert path is not None
-    return read_lens(path, image_size_wh, name=name, scale=scale)
-
-
-def lens_from_matrix(K: Float[np.ndarray, "3 3"], image_size_wh: Size) -> Camera:
-    """A lens without distortion, with intrinsics K, at the world's origin."""
-    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
-
-
-def read_lens(
-    path: Path | str, image_size_wh: Size, *, name: str | None = None, scale: bool = False
-) -> Camera:
-    """Read the lens of one camera, for images of a given size.
-
-    Args:
-        path: calibration file: any that `read_lenses` reads, or the dataset's `drone_cameras_calibration.csv`.
-        image_size_wh: width and height of the images in pixels.
         name: name of the camera; needed where the file has several cameras.
         scale: scale a lens that is for a larger or smaller form of the same images.
 
     Raises:
         InputError: the file cannot be read, has no camera of this name, or its lens is for images of another size.
+        SettingsError: a file and fields of view are given, or neither, or angles that no lens has.
     """
+    if fov_deg is not None and path is None:
+        return lens_of_view(*fov_deg, image_size_wh)
+    if path is None or fov_deg is not None:
+        found = "neither" if path is None else "both"
+        raise SettingsError("lens", expected="--camera FILE or --fov H,V", found=found)
     path = Path(path)
     rig = _read_cameras(path, image_size_wh)
     if name is None and len(rig) > 1:
@@ -100,6 +78,11 @@ def read_lens(
         )
         raise InputError(path, expected=expected, found=found, remedy=remedy)
     return scale_lens(lens, image_size_wh)
+
+
+def lens_from_matrix(K: Float[np.ndarray, "3 3"], image_size_wh: Size) -> Camera:
+    """A lens without distortion, with intrinsics K, at the world's origin."""
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
 
 
 def check_size(where: Path | str, lens: Camera, image_size_wh: Size) -> None:

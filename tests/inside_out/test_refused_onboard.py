@@ -41,7 +41,7 @@ from psotrack.inside_out import (
     write_camera_path,
 )
 from psotrack.inside_out.filtering import Agility, FilterRun, poses_of, step
-from psotrack.inside_out.lens_files import read_lens
+from psotrack.inside_out.lens_files import choose_lens
 from psotrack.inside_out.mapping import complete_map
 from psotrack.inside_out.mapping.sightings import collect_sightings
 from psotrack.inside_out.pose import CornerNoise, estimate_pose
@@ -99,7 +99,7 @@ def reads_lens(size_wh, **options):
 
     def prepare(folder, run):
         write_rig(folder / "lens.toml", make_rig({"left": DRAWN_LENS, "right": DRAWN_LENS}))
-        return partial(read_lens, folder / "lens.toml", size_wh, **options)
+        return partial(choose_lens, size_wh, path=folder / "lens.toml", fov_deg=None, **options)
 
     return prepare
 
@@ -107,7 +107,7 @@ def reads_lens(size_wh, **options):
 def reads_lens_without_size(folder, run):
     """The dataset's CSV has no size of the images."""
     write_calibration(folder / "cameras.csv", make_rig({"cam1i": simple_lens(400.0, (640, 480))}))
-    return partial(read_lens, folder / "cameras.csv", (1920, 1080))
+    return partial(choose_lens, (1920, 1080), path=folder / "cameras.csv", fov_deg=None)
 
 
 def reads_c3d(names, position_m):
@@ -211,7 +211,6 @@ BAD = {
     "min_markers": (calls(PoseSettings, min_markers=0), "min_markers: expected at least 1, found 0"),
     "focal_error": (calls(PoseSettings, focal_error=-0.1), "a number from 0 to below 1, found -0.1"),
     "scale": (calls(CornerNoise, scale=0.0), "scale"),
-    "false_alarm": (calls(PoseFilterParams, false_alarm=0.0), "a probability above 0 and below 1, found 0"),
     "longest_gap_s": (calls(PoseFilterParams, longest_gap_s=-1.0), "a number above 0, found -1"),
     "confirm": (calls(PoseFilterParams, confirm=0), "confirm: expected at least 1, found 0"),
     "earlier frame": (calls(STEPPED, BEGUN, 0.0, poses_of(PATH)[1]), "a time after 0.04 s, found 0 s"),

@@ -37,7 +37,7 @@ _MARGIN_CELLS = 3.0
 _CHUNK_FRAMES = 25
 #: Least number of instants of a stretch, and largest number of stretches.
 _LEAST_INSTANTS, _MOST_STRETCHES = 60, 12
-#: A drift counts only beyond this multiple of its standard deviation: over seconds all clocks run alike.
+#: What counts only beyond this multiple of its standard deviation: a drift, because over seconds all clocks run alike.
 _CLEARLY = 5.0
 #: An offset counts only if its standard deviation is below this share of an interval between instants.
 _KNOWN = 0.25
@@ -121,10 +121,10 @@ class CameraClocks:
             of_camera.append({"before_frame": lost.frame, "count": lost.count})
         return found
 
-    def is_certain(self, least_s: float, multiple: float = 5.0) -> Bool[np.ndarray, "cameras"]:
-        """(cameras,), whether an offset is at least `least_s`, and this multiple of its standard deviation."""
+    def is_certain(self, least_s: float) -> Bool[np.ndarray, "cameras"]:
+        """(cameras,), whether an offset is at least `least_s`, and clearly more than its standard deviation."""
         size_s = np.abs(self.offset_s)
-        return (size_s >= least_s) & (size_s > multiple * self.offset_std_s)
+        return (size_s >= least_s) & (size_s > _CLEARLY * self.offset_std_s)
 
 
 def clocks_of_tracks(
@@ -361,7 +361,7 @@ def _most_certain_step(stretches: _Stretches) -> _Step | None:
         )
         # Of two cameras, that which is later afterwards has lost frames.
         jump_s = step.coefficients[:, 1] - np.sort(step.coefficients[:, 1])[(offset_s.shape[1] - 1) // 2]
-        certainty = np.divide(jump_s, step.slope_std, out=np.zeros(len(jump_s)), where=step.slope_std > 0)
+        certainty = np.divide(jump_s, step.std[:, 1], out=np.zeros(len(jump_s)), where=step.std[:, 1] > 0)
         camera = int(certainty.argmax())
         if step.scatter < line.scatter and certainty[camera] > _CLEARLY:
             steps.append(_Step(camera, step.coefficients[:, 0], float(jump_s[camera]), step.scatter))
@@ -433,11 +433,11 @@ def fit_clocks(
     drift, drift_std = np.zeros(num_cameras), np.full(num_cameras, np.inf)
     if num_stretches >= 3:
         line = _fit(np.stack([even, time_s - middle_s], axis=-1), offset_s, std_s)
-        found, drift_std = line.coefficients[:, 1] - np.median(line.coefficients[:, 1]), line.slope_std
+        found, drift_std = line.coefficients[:, 1] - np.median(line.coefficients[:, 1]), line.std[:, 1]
         if (np.abs(found) > _CLEARLY * drift_std).any():
             drift, used = found, line
     seen = np.isfinite(std_s).any(axis=0)
-    offset_std_s = np.where(seen, used.offset_std, np.inf)
+    offset_std_s = np.where(seen, used.std[:, 0], np.inf)
     known, fitted_s = offset_std_s < known_s, used.coefficients[:, 0]
     zero_s = float(np.median(fitted_s[known])) if known.any() else 0.0
     offset_s = np.where(known, fitted_s - zero_s, 0.0)
@@ -445,21 +445,11 @@ def fit_clocks(
 
 
 class _Fit(NamedTuple):
-    """Coefficients of each camera, relative to the mean of all, their covariance, and the scatter about them."""
+    """Coefficients of each camera, relative to the mean of all, standard deviations, and the scatter about them."""
 
     coefficients: Float[np.ndarray, "cameras terms"]
-    covariance: Float[np.ndarray, "unknowns unknowns"]
+    std: Float[np.ndarray, "cameras terms"]
     scatter: float
-
-    @property
-    def offset_std(self) -> Float[np.ndarray, "cameras"]:
-        """(cameras,), standard deviations of the first coefficients."""
-        return np.sqrt(np.diag(self.covariance)[:: self.coefficients.shape[1]])
-
-    @property
-    def slope_std(self) -> Float[np.ndarray, "cameras"]:
-        """(cameras,), standard deviations of the second coefficients of two."""
-        return np.sqrt(np.diag(self.covariance)[1::2])
 
 
 def _fit(
@@ -471,11 +461,10 @@ def _fit(
     (num_stretches, terms), num_cameras = basis.shape, offset_s.shape[1]
     unknowns = num_cameras * terms
     weight = 1 / np.maximum(std_s, 1e-9).ravel()
-    design = np.zeros((num_stretches, num_cameras, unknowns + num_stretches))
-    for camera in range(num_cameras):
-        design[:, camera, camera * terms : (camera + 1) * terms] = basis
-    design[np.arange(num_stretches), :, unknowns + np.arange(num_stretches)] = 1.0
-    design = weight[:, None] * design.reshape(-1, unknowns + num_stretches)
+    # Rows are those of each camera in one stretch after the other; each stretch has a zero of its own.
+    of_cameras = np.einsum("st,cd->scdt", basis, np.eye(num_cameras)).reshape(-1, unknowns)
+    zeros = np.repeat(np.eye(num_stretches), num_cameras, axis=0)
+    design = weight[:, None] * np.concatenate([of_cameras, zeros], axis=1)
     # A common change of all cameras and all zeros changes nothing: the pseudo-inverse takes the smallest solution.
     inverse = np.linalg.pinv(design)
     solution = inverse @ (weight * offset_s.ravel())
@@ -488,4 +477,5 @@ def _fit(
     share = known / known.sum() if known.any() else np.full(num_cameras, 1 / num_cameras)
     centred = np.kron(np.eye(num_cameras) - share, np.eye(terms))
     coefficients = solution[:unknowns].reshape(num_cameras, terms)
-    return _Fit(coefficients - share @ coefficients, centred @ covariance @ centred.T, scatter)
+    std = np.sqrt(np.diag(centred @ covariance @ centred.T)).reshape(num_cameras, terms)
+    return _Fit(coefficients - share @ coefficients, std, scatter)

@@ -138,20 +138,18 @@ def _of_judged(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
     return _in_words(kind, rig.cameras[camera], after.rig.cameras[camera], late_s, std)
 
 
-def _in_words(
-    kind: str, before: Camera, after: Camera, late_s: float, std: float | None = None
-) -> tuple[str, str]:
-    """What is wrong and by how much, with a standard deviation where it is known, and what to do."""
+def _in_words(kind: str, before: Camera, after: Camera, late_s: float, std: float) -> tuple[str, str]:
+    """What is wrong and by how much, with a standard deviation, and what to do."""
     if kind == "clock":
-        known = "" if std is None else f" (± {1e3 * std:.0f} ms)"
-        words = f"its video is {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}{known}"
+        when = "late" if late_s > 0 else "early"
+        words = f"its video is {1e3 * abs(late_s):.0f} ms {when} (± {1e3 * std:.0f} ms)"
         return words, (
             "track with --clocks auto, which finds it to a millisecond or so; "
             f"or add {-late_s:.4f} to its time_offset_s"
         )
     scale = float(after.K[0, 0] / before.K[0, 0])
-    known = "" if std is None else f" (± {100 * std:.1f} %)"
-    how = f"{100 * abs(1 / scale - 1):.1f} % too {'short' if scale > 1 else 'long'}{known}"
+    too = "short" if scale > 1 else "long"
+    how = f"{100 * abs(1 / scale - 1):.1f} % too {too} (± {100 * std:.1f} %)"
     if kind == "focal lengths":
         return f"all focal lengths are {how}", (
             f"multiply them by {scale:.3f}, or calibrate each lens anew with `psotrack calibrate rig`"

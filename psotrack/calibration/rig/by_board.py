@@ -86,9 +86,7 @@ def calibrate_by_board(
         stated = Board.of(settings)
     with errors_name(f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else sources[0]):
         found, lenses, shifts = _find_views(stated, cameras, instants, lenses, settings.floor, report)
-        every = {camera.name: len(camera.frames) for camera in cameras}
-        searched = zip(found.views.names, found.searched.tolist(), strict=True)
-        said += say_searched({name: (count, every[name]) for name, count in searched})
+        said += say_searched(found)
         said += say_starts(found.views.names, shifts)
         calibrated = calibrate_rig(found.board, found.views, lenses, floor=settings.floor, report=report)
     if given is not None:

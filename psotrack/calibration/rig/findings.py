@@ -149,13 +149,10 @@ def worst_views(calibrated: CalibratedRig) -> list[tuple[str, int, float]]:
     ]
 
 
-def say_searched(searched: Mapping[str, tuple[int, int]]) -> list[str]:
-    """A sentence on frames of long videos that were left out.
-
-    Args:
-        searched: by the name of each camera, how many frames were searched for the board, of how many.
-    """
-    fewer = [f"{name} {some} of {every}" for name, (some, every) in searched.items() if some < every]
+def say_searched(found: FoundBoards) -> list[str]:
+    """A sentence on frames of long videos that were left out."""
+    counts = zip(found.views.names, found.searched.tolist(), found.frames.tolist(), strict=True)
+    fewer = [f"{name} {some} of {every}" for name, some, every in counts if some < every]
     return [f"frames that were searched for the board, evenly spread: {', '.join(fewer)}"] if fewer else []
 
 

@@ -282,12 +282,14 @@ class FoundBoards:
         board: the board, with the pattern that was found.
         mirrored: (cameras,), number of views in which the board is seen mirrored.
         searched: (cameras,), number of images that were searched.
+        frames: (cameras,), number of all images.
     """
 
     views: BoardViews
     board: Board
     mirrored: Int[np.ndarray, " cameras"]
     searched: Int[np.ndarray, " cameras"]
+    frames: Int[np.ndarray, " cameras"]
 
 
 def find_views(
@@ -340,7 +342,8 @@ def find_views(
                 found=f"none in {count} frames",
                 remedy="check that the board is in its images, sharp and large enough, or leave the camera out",
             )
-    return FoundBoards(views.select(np.asarray(views.seen.any(axis=0))), board, mirrored, searched)
+    every = np.array([len(camera.frames) for camera in cameras])
+    return FoundBoards(views.select(np.asarray(views.seen.any(axis=0))), board, mirrored, searched, every)
 
 
 def _check_markers(board: Board, images: Iterator[UInt8[np.ndarray, "height width"]]) -> None:

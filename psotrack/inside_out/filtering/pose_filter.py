@@ -35,6 +35,8 @@ from psotrack.inside_out.filtering.motion import (
 from psotrack.inside_out.pose import CameraPose
 from psotrack.trajectories import Status
 
+#: Probability that a good pose is gated, if errors are normal; those of videos are more often large.
+_FALSE_ALARM = 1e-4
 #: Number of successive poses that distinguish a turn, which only the wildest drone flies, from an outlier.
 _TURN_POSES = 2
 _WILDEST = Agility(50.0, 20.0)
@@ -57,7 +59,6 @@ class PoseFilterParams:
     """Parameters of the pose filter.
 
     Attributes:
-        false_alarm: probability that a good pose is gated, if errors are normal; those of videos are more often large.
         longest_gap_s: time without a fitting pose after which no pose is returned until poses are confirmed again,
             seconds.
         confirm: number of poses that must agree before the first pose is returned, unless the markers of one pose agree
@@ -67,17 +68,12 @@ class PoseFilterParams:
             beyond chance.
     """
 
-    false_alarm: float = 1e-4
     longest_gap_s: float = 0.5
     confirm: int = 3
     restart_after: int = 10
 
     def __post_init__(self) -> None:
         check_positive("longest_gap_s", self.longest_gap_s)
-        if not 0 < self.false_alarm < 1:
-            raise SettingsError(
-                "false_alarm", expected="a probability above 0 and below 1", found=f"{self.false_alarm:g}"
-            )
         for name in ("confirm", "restart_after"):
             if getattr(self, name) < 1:
                 raise SettingsError(name, expected="at least 1", found=f"{getattr(self, name)}")
@@ -257,7 +253,7 @@ def _updated(
     """A track with one more pose.
 
     A pose is gated where its squared Mahalanobis distance from the prediction exceeds the value that chi-square with 6
-    degrees of freedom exceeds with probability `false_alarm`. An ambiguous pose is weighted by the probability that it
+    degrees of freedom exceeds with probability `_FALSE_ALARM`. An ambiguous pose is weighted by the probability that it
     is the right one, given how well it fits.
     """
     predicted, _, _ = predict(track.motion, time_s - track.seen_s, agility)
@@ -275,7 +271,7 @@ def _updated(
         track.sure or _is_sure(pose),
         pose.constant,
     )
-    return _Updated(more, bool(nis <= chdtri(6, params.false_alarm)), robust)
+    return _Updated(more, bool(nis <= chdtri(6, _FALSE_ALARM)), robust)
 
 
 def probability_right(

@@ -82,7 +82,6 @@ def find_sightings(
     videos: Sequence[tuple[VideoInfo, Camera]],
     dictionary: str = "4x4_1000",
     *,
-    most_frames: int = MOST_FRAMES,
     report: Report = no_progress,
 ) -> MarkerSightings:
     """Find the markers in videos of one room.
@@ -90,7 +89,6 @@ def find_sightings(
     Args:
         videos: videos with the lens of each, for images of its size.
         dictionary: name of the markers' dictionary, such as 4x4_50.
-        most_frames: largest number of frames of a video that are searched.
         report: progress is reported to it.
 
     Raises:
@@ -101,7 +99,7 @@ def find_sightings(
         check_size(video.path, lens, video.image_size_wh)
     detectors = [MarkerDetector(dictionary, lens=lens) for _, lens in videos]
     seen = []
-    numbers = [_searched(video.num_frames, most_frames) for video, _ in videos]
+    numbers = [_searched(video.num_frames) for video, _ in videos]
     with report("markers", sum(map(len, numbers))) as advance:
         for source, (video, _) in enumerate(videos):
             times_s = frame_times(video).time_s.tolist()
@@ -113,11 +111,11 @@ def find_sightings(
     return collect_sightings(seen, [lens for _, lens in videos], name)
 
 
-def _searched(num_frames: int, most: int) -> list[int]:
+def _searched(num_frames: int) -> list[int]:
     """Numbers of frames that are evenly spread, and of the next one of each fourth of them, which shows the motion."""
-    if num_frames <= most:
+    if num_frames <= MOST_FRAMES:
         return list(range(num_frames))
-    spread = np.linspace(0, num_frames - 2, most * 4 // 5).astype(int)
+    spread = np.linspace(0, num_frames - 2, MOST_FRAMES * 4 // 5).astype(int)
     return np.union1d(spread, spread[::4] + 1).tolist()
 
 
