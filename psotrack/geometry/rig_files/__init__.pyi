@@ -1,4 +1,3 @@
-from .dpjait_calibration import write_calibration
 from .fields import UNITS_M, CameraFields, Entry, camera_values
 from .formats import (
     RIG_FORMATS,
@@ -10,6 +9,7 @@ from .formats import (
     rescale_lenses,
     write_rig,
 )
+from .text_files import write_calibration
 from .toml_files import KEYS, fields_of_table
 
 __all__ = [

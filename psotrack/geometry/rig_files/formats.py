@@ -17,9 +17,9 @@ import numpy as np
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Camera, Rig, make_rig, scale_lens
-from psotrack.geometry.rig_files import dpjait_calibration, number_files, toml_files, xml_files, yaml_files
-from psotrack.geometry.rig_files.dpjait_calibration import write_calibration
+from psotrack.geometry.rig_files import text_files, toml_files, xml_files, yaml_files
 from psotrack.geometry.rig_files.fields import UNITS_M, CameraFields, Entry
+from psotrack.geometry.rig_files.text_files import write_calibration
 from psotrack.support import read_text, read_toml, refuse_to_overwrite
 
 _logger = logging.getLogger(__name__)
@@ -55,11 +55,11 @@ _OF_TEXT: Mapping[str, _Format] = {
     "vicon": _Format(xml_files.read_vicon, xml_files.is_vicon),
     "easymocap": _Format(yaml_files.read_easymocap, yaml_files.is_easymocap),
     "kalibr": _Format(yaml_files.read_kalibr, yaml_files.is_kalibr),
-    "handpose3d": _Format(number_files.read_handpose3d, number_files.is_handpose3d),
-    "argus": _Format(number_files.read_argus, number_files.is_argus),
-    "dlt": _Format(number_files.read_dlt, number_files.is_dlt),
+    "handpose3d": _Format(text_files.read_handpose3d, text_files.is_handpose3d),
+    "argus": _Format(text_files.read_argus, text_files.is_argus),
+    "dlt": _Format(text_files.read_dlt, text_files.is_dlt),
     "opencv": _Format(yaml_files.read_opencv, yaml_files.is_opencv, yaml_files.write_opencv),
-    "dpjait": _Format(dpjait_calibration.read, dpjait_calibration.recognises, write_calibration),
+    "dpjait": _Format(text_files.read_dpjait, text_files.is_dpjait, write_calibration),
 }
 _FORMATS = {**_OF_TOML, **_OF_TEXT}
 #: Format by the ending of a name, for files to be written, and for files whose content says nothing.
