@@ -4,8 +4,7 @@ from .bundle import GATE, Bundle, BundleProblem, BundleState, KnownLens, spread_
 from .extrinsics import Located, Solver, locate_camera, ray_distances, solve_pnp, solve_pnp_ransac
 from .lens_models import LensModel, known_lenses, lens_of_view, parse_lens_model
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, start_lenses
-from .rig.by_board import calibrate_by_board
-from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
+from .rig.calibrations import calibrate_by_board, calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
     RigCalibration,
     advise,

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import ceil
+from math import ceil, hypot
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack.calibration.rig.adjustment import CalibratedRig
 from psotrack.calibration.rig.views import FoundBoards
 from psotrack.errors import InputError
 from psotrack.geometry import Rig
-from psotrack.support import html_block, html_table, save_figure, text_table
+from psotrack.support import (
+    POSITION,
+    finite_or_none,
+    format_numbers,
+    html_block,
+    html_table,
+    save_figure,
+    text_table,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,8 +45,9 @@ _MISFIT = 0.005
 _PICTURES = 4
 #: Residuals from this multiple of the median residual on have the brightest colour.
 _BRIGHT = 4.0
-#: Number of views that are named.
+#: Number of views, and of points of each camera, that are named: those that fit worst.
 _WORST = 5
+_HEADINGS = ("camera", "views", "rms (px)", "f (px)", POSITION, "std (mm)")
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,6 +91,122 @@ class RigCalibration:
     def _repr_html_(self) -> str:
         """What a notebook shows: the table of the cameras, and the sentences."""
         return html_block("; ".join(self.after), html_table(*self.table))
+
+
+def result_of_board(
+    calibrated: CalibratedRig, said: list[str], printed: list[str], world: str, begins: Mapping[str, int]
+) -> RigCalibration:
+    """A calibration by a board: the figures of the cameras, the views that fit worst, and what to do.
+
+    Args:
+        calibrated: the rig, and how it fits each view.
+        said: sentences on the board, and on which frames were searched for it.
+        printed: sentences on how the board was printed and seen.
+        world: what the world is.
+        begins: by how many frames each camera begins after the first one.
+    """
+    figures, worst, advice = figures_of(calibrated), worst_views(calibrated), advise(calibrated)
+    rows = [
+        (
+            name,
+            f"{row['views']}",
+            f"{row['rms_px']:.2f}",
+            f"{row['focal_px'][0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row['focal_std_px'][0]:.1f}",
+            format_numbers(row["centre_m"], 3),
+            f"{1e3 * hypot(*row['centre_std_m']):.1f}",
+        )
+        for name, row in figures.items()
+    ]
+    models = ", ".join(f"{name} {row['lens']}" for name, row in figures.items())
+    more = {
+        "print": printed,
+        "begins": dict(begins),
+        "worst_views": [dict(zip(("camera", "frame", "residual_px"), view, strict=True)) for view in worst],
+        "advice": advice,
+        "world": world,
+    }
+    after = [
+        f"lens models (distortion coefficients): {models}",
+        f"worst views (camera, frame, px): {', '.join(f'{name} {frame} {px:.2f}' for name, frame, px in worst)}",
+        *advice,
+        f"the world is {world}",
+    ]
+    return RigCalibration(
+        calibrated.rig,
+        figures,
+        (_HEADINGS, rows),
+        [*said, *printed],
+        after,
+        more,
+        calibrated,
+        misfit=find_misfit(calibrated, advice),
+    )
+
+
+@dataclass(frozen=True)
+class PointFit:
+    """How points fit one camera.
+
+    Attributes:
+        points: names of the points.
+        covariance_m2: (3, 3), covariance of the camera's centre, m².
+        residual_px: (points,), distances of the points from their projections, pixels; infinite behind the camera.
+        used: (points,), False for points that were left out.
+    """
+
+    points: Sequence[Any]
+    covariance_m2: Float[np.ndarray, "3 3"]
+    residual_px: Float[np.ndarray, " points"]
+    used: Bool[np.ndarray, " points"]
+
+
+def result_of_points(rig: Rig, fits: Mapping[str, PointFit], notes: Sequence[str]) -> RigCalibration:
+    """The result of a calibration by points: positions, standard deviations, and the points that fit worst.
+
+    Args:
+        rig: the cameras.
+        fits: how the points fit each camera.
+        notes: sentences on the world, and on what the points do not determine.
+    """
+    cameras, rows, worst = {}, [], []
+    for name, centre_m in zip(rig.names, np.asarray(rig.cameras.centre_world), strict=True):
+        fit = fits[name]
+        std_m = np.sqrt(np.diag(fit.covariance_m2))
+        rms_px = float(np.sqrt(np.mean(fit.residual_px[fit.used] ** 2))) if fit.used.any() else None
+        points = [
+            {
+                "point": str(fit.points[index]),
+                "residual_px": finite_or_none(fit.residual_px[index]),
+                "used": bool(fit.used[index]),
+            }
+            for index in np.argsort(-fit.residual_px)[:_WORST]
+        ]
+        cameras[name] = {
+            "centre_m": centre_m.tolist(),
+            "centre_std_m": std_m.tolist(),
+            "points": len(fit.used),
+            "used": int(fit.used.sum()),
+            "rms_px": rms_px,
+            "worst": points,
+        }
+        rows.append(
+            (
+                name,
+                f"{fit.used.sum()} of {len(fit.used)}",
+                "" if rms_px is None else f"{rms_px:.2f}",
+                format_numbers(centre_m.tolist(), 3),
+                format_numbers((1e3 * std_m).tolist(), 1),
+            )
+        )
+        # Names of points may be too long for a column.
+        worst.append(f"{name}, worst points (px): {', '.join(map(_point_in_words, points))}")
+    table = ("camera", "points", "rms (px)", POSITION, "std (mm)"), rows
+    return RigCalibration(rig, cameras, table, after=[*worst, *notes], more={"notes": list(notes)})
+
+
+def _point_in_words(one: dict[str, Any]) -> str:
+    distance = "behind" if one["residual_px"] is None else f"{one['residual_px']:.1f}"
+    return f"{one['point']} {distance}{'' if one['used'] else ' left out'}"
 
 
 def figures_of(calibrated: CalibratedRig) -> dict[str, dict[str, Any]]:

@@ -22,8 +22,8 @@ counts columns from 1 (and DLTdv8 rows, too; `dlt_invert.m` of https://github.co
 origin to the other). Places from its files are therefore shown 1 pixel too far to the right (and below): a file does
 not say which program wrote it. There is no lens distortion: pixels must be undistorted ones.
 
-**Argus**'s profile has a line `camera fx w h cx cy AR k1 k2 t1 t2 k3` per camera and no poses. AR is fy / fx; k1, k2,
-t1, t2, k3 are OpenCV's k1, k2, p1, p2, k3. The format: `docs/user-guide.md` of the same repository (there k1, k2, k3 are
+**Argus**'s profile has a line `camera fx w h cx cy AR k1 k2 t1 t2 k3` per camera, no poses. AR is fy / fx; k1, k2, t1,
+t2, k3 are OpenCV's k1, k2, p1, p2, k3. The format: `docs/user-guide.md` of the same repository (there k1, k2, k3 are
 r2, r4, r6). Argus takes cy and t1 for pixels counted upwards where it undistorts clicked points
 (`tools.undistort_pts`), but estimates them on images, downwards (`patterns`). Here they are those of images; the two
 differ only if cy is not in the middle or t1 is not 0. Argus undistorts with fx alone; AR is 1 in its profiles.

@@ -1,18 +1,29 @@
-"""A rig from points instead of a board: one that moves, the two ends of a stick, or points of known place."""
+"""A rig from a board, or from points: one that moves, the two ends of a stick, or points of known place."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from psotrack.calibration.board_recognition import describe_board, detect_board
+from psotrack.calibration.boards import Board
 from psotrack.calibration.extrinsics import locate_camera
-from psotrack.calibration.lens_models import lens_of_view, lenses_at_size
-from psotrack.calibration.rig.findings import RigCalibration
+from psotrack.calibration.lens_models import known_lenses, lens_of_view, lenses_at_size, parse_lens_model
+from psotrack.calibration.rig.adjustment import LensChoice, calibrate_rig, in_new_world, start_lenses
+from psotrack.calibration.rig.findings import (
+    PointFit,
+    RigCalibration,
+    result_of_board,
+    result_of_points,
+    say_print,
+    say_searched,
+    say_starts,
+)
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
     PointRig,
@@ -32,37 +43,113 @@ from psotrack.calibration.rig.point_files import (
     world_in_words,
 )
 from psotrack.calibration.rig.settings import RigSettings
-from psotrack.calibration.rig.shifts import find_point_shifts
-from psotrack.calibration.rig.views import open_images
+from psotrack.calibration.rig.shifts import find_board_shifts, find_point_shifts
+from psotrack.calibration.rig.views import (
+    CameraImages,
+    FoundBoards,
+    Instants,
+    choose_instants,
+    find_views,
+    first_images,
+    instants_of_numbers,
+    open_images,
+    open_recorded,
+)
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
 from psotrack.geometry import Rig, chosen_camera, make_rig
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings import read_detections
 from psotrack.recordings.datasets import is_recording, open_recording
-from psotrack.support import POSITION, finite_or_none, format_numbers
+from psotrack.support import Report, no_progress
 
+_logger = logging.getLogger(__name__)
+
+#: Largest number of times that the views are found: after two shifts the frames are the right ones.
+_MOST_ROUNDS = 3
 #: Fraction of the sightings below which the user is told how few are used.
 _FEW_USED = 0.5
-#: Number of points that are shown by name for each camera, those that fit worst.
-_WORST = 5
 
 
-@dataclass(frozen=True)
-class PointFit:
-    """How points fit one camera.
+def calibrate_by_board(
+    sources: Sequence[Path], settings: RigSettings, report: Report = no_progress
+) -> RigCalibration:
+    """Calibrate a rig by a board that is moved before the cameras.
 
-    Attributes:
-        points: names of the points.
-        covariance_m2: (3, 3), covariance of the camera's centre, m².
-        residual_px: (points,), distances of the points from their projections, pixels; infinite behind the camera.
-        used: (points,), False for points that were left out.
+    Args:
+        sources: a video, a folder of images or a pattern of each camera; or one recording.
+        settings: what is known.
+        report: display of the progress.
+
+    Raises:
+        InputError: an image cannot be read, the board is not seen, or the views do not determine the rig.
+        SettingsError: the settings do not say what the board is like, or do not fit the sources.
     """
+    given = None if settings.world is None else read_world(settings.world)
+    if len(sources) == 1 and is_recording(sources[0]):
+        cameras, instants = open_recorded(open_recording(sources[0]))
+    else:
+        cameras = open_images(sources, settings.names)
+        instants = instants_of_numbers(cameras)
+    lenses, said = _lens_choice(settings, cameras), []
+    if settings.squares is None:
+        stated = detect_board(settings.square_m or 0.0, first_images(cameras, 4))
+        said.append(f"the board is {describe_board(stated)}")
+        _logger.info("%s", said[0])
+    else:
+        stated = Board.of(settings)
+    with errors_name(f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else sources[0]):
+        found, lenses, shifts = _find_views(stated, cameras, instants, lenses, settings.floor, report)
+        said += say_searched(found)
+        said += say_starts(found.views.names, shifts)
+        calibrated = calibrate_rig(found.board, found.views, lenses, floor=settings.floor, report=report)
+    if given is not None:
+        with errors_name(given.path):
+            change, left_m = fit_world(calibrated.rig, given, with_scale=False)
+        calibrated, place = in_new_world(calibrated, change), world_in_words(given.path, left_m)
+    elif settings.floor is not None:
+        place = f"the board in frame {settings.floor}: its first corner is the origin, z points up"
+    else:
+        first = calibrated.rig.names[0]
+        place = f"camera {first}: x right, y down, z forward; --floor and --world place it elsewhere"
+    begins = {name: -shift for name, shift in zip(found.views.names, shifts, strict=True)}
+    return result_of_board(calibrated, said, say_print(found), place, begins)
 
-    points: Sequence[Any]
-    covariance_m2: Float[np.ndarray, "3 3"]
-    residual_px: Float[np.ndarray, " points"]
-    used: Bool[np.ndarray, " points"]
+
+def _find_views(
+    board: Board,
+    cameras: Sequence[CameraImages],
+    instants: Instants,
+    lenses: LensChoice,
+    floor: int | None,
+    report: Report,
+) -> tuple[FoundBoards, LensChoice, list[int]]:
+    """Views of the board at instants that are counted as its motion says.
+
+    Also the lenses from which an adjustment starts, and at how many instants later each camera shows what the first
+    one shows.
+    """
+    shifts = np.zeros(len(cameras), np.int64)
+    for _ in range(_MOST_ROUNDS):
+        found = find_views(board, cameras, choose_instants(instants, floor, shifts.tolist()), report)
+        if lenses.start is None:
+            lenses = replace(lenses, start=start_lenses(found.board, found.views, lenses, report))
+        # A shift that is found between searched frames is looked at once more where it has these frames.
+        more = find_board_shifts(found.board, found.views, lenses.start or {})
+        if not more.any():
+            break
+        shifts += more
+    return found, lenses, shifts.tolist()
+
+
+def _lens_choice(settings: RigSettings, cameras: Sequence[CameraImages]) -> LensChoice:
+    model = parse_lens_model(settings.lens)
+    if settings.lenses is None:
+        return LensChoice(model)
+    sizes_wh = {camera.name: camera.image_size_wh for camera in cameras}
+    return LensChoice(
+        model, known_lenses(lenses_at_size(settings.lenses, read_lenses(settings.lenses), sizes_wh))
+    )
 
 
 def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> RigCalibration:
@@ -116,7 +203,7 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
         fits[name] = PointFit(found.views.number[seen].tolist(), covariance_m2[index], residual_px, used)
     shifts = map(str, find_point_shifts(found.rig, views))
     notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
-    return _calibration(rig, fits, notes)
+    return result_of_points(rig, fits, notes)
 
 
 def calibrate_by_known_points(
@@ -168,7 +255,7 @@ def calibrate_by_known_points(
                 f"the residuals of {name} are not noise: another lens explains them, and has the camera "
                 f"{1e3 * located.lens_shift_m:.0f} mm away, which its standard deviation contains; calibrate its lens"
             )
-    return _calibration(make_rig(cameras), fits, notes)
+    return result_of_points(make_rig(cameras), fits, notes)
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
@@ -259,52 +346,3 @@ def _read_views(sources: Sequence[Path]) -> PointViews:
     line_time_s = {each.name: each.line_time_s for each in recording.cameras}
     with errors_name(sources[0]):
         return views_of_detections(boxes, times, line_time_s)
-
-
-def _calibration(rig: Rig, fits: Mapping[str, PointFit], notes: Sequence[str]) -> RigCalibration:
-    """The result of a calibration by points: positions, standard deviations, and the points that fit worst.
-
-    Args:
-        rig: the cameras.
-        fits: how the points fit each camera.
-        notes: sentences on the world, and on what the points do not determine.
-    """
-    cameras, rows, worst = {}, [], []
-    for name, centre_m in zip(rig.names, np.asarray(rig.cameras.centre_world), strict=True):
-        fit = fits[name]
-        std_m = np.sqrt(np.diag(fit.covariance_m2))
-        rms_px = float(np.sqrt(np.mean(fit.residual_px[fit.used] ** 2))) if fit.used.any() else None
-        points = [
-            {
-                "point": str(fit.points[index]),
-                "residual_px": finite_or_none(fit.residual_px[index]),
-                "used": bool(fit.used[index]),
-            }
-            for index in np.argsort(-fit.residual_px)[:_WORST]
-        ]
-        cameras[name] = {
-            "centre_m": centre_m.tolist(),
-            "centre_std_m": std_m.tolist(),
-            "points": len(fit.used),
-            "used": int(fit.used.sum()),
-            "rms_px": rms_px,
-            "worst": points,
-        }
-        rows.append(
-            (
-                name,
-                f"{fit.used.sum()} of {len(fit.used)}",
-                "" if rms_px is None else f"{rms_px:.2f}",
-                format_numbers(centre_m.tolist(), 3),
-                format_numbers((1e3 * std_m).tolist(), 1),
-            )
-        )
-        # Names of points may be too long for a column.
-        worst.append(f"{name}, worst points (px): {', '.join(map(_in_words, points))}")
-    table = ("camera", "points", "rms (px)", POSITION, "std (mm)"), rows
-    return RigCalibration(rig, cameras, table, after=[*worst, *notes], more={"notes": list(notes)})
-
-
-def _in_words(one: dict[str, Any]) -> str:
-    distance = "behind" if one["residual_px"] is None else f"{one['residual_px']:.1f}"
-    return f"{one['point']} {distance}{'' if one['used'] else ' left out'}"
