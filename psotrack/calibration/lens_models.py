@@ -167,8 +167,7 @@ def known_lenses(rig: Rig) -> dict[str, tuple[LensModel, np.ndarray]]:
         is_fisheye = bool(camera.fisheye)
         allowed = (FISHEYE_COEFFICIENTS,) if is_fisheye else PINHOLE_COEFFICIENTS
         size = next((n for n in allowed if n >= len(dist)), allowed[-1])
-        padded = np.zeros(size)
-        padded[: len(dist)] = dist[:size]
+        padded = np.pad(dist[:size], (0, max(0, size - len(dist))))
         values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], padded])
         known[name] = LensModel(size, is_fisheye), values
     return known

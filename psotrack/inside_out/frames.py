@@ -139,13 +139,11 @@ def open_source(source: Path | str, *, fps: float | None = None, live: bool = Fa
                 found="no --fps",
                 remedy="add it in frames per second, such as --fps 25",
             )
-        video = open_pictures(path, fps)
-        return _recorded(video)
+        return _recorded(open_pictures(path, fps))
     if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
         remedy = "name the images' folder, and pass --fps"
         raise InputError(path, expected="a video, or a folder of images", found="one image", remedy=remedy)
-    video = open_video(path, fps)
-    return _recorded(video)
+    return _recorded(open_video(path, fps))
 
 
 def _recorded(video: VideoInfo) -> FrameSource:

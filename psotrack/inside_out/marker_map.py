@@ -115,8 +115,10 @@ class MarkerMap:
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "markers 3"]:
-        """(markers, 3), unit normals, out of the printed side, in the order of `ids`."""
-        return normals(self.all_corners_m)
+        """(markers, 3), unit normals, towards the side from which the corners are clockwise, in the order of `ids`."""
+        first, second, third, fourth = self.all_corners_m.swapaxes(0, 1)
+        across = np.cross(fourth - second, third - first)
+        return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
 
 
 @dataclass(frozen=True)
@@ -254,14 +256,6 @@ def read_measured_corners(path: Path | str) -> dict[int, MarkerRow]:
 def sides_m(corners_m: Float[np.ndarray, "markers 4 3"]) -> Float[np.ndarray, " markers"]:
     """Mean length of each marker's four sides, metres."""
     return np.linalg.norm(np.roll(corners_m, -1, axis=-2) - corners_m, axis=-1).mean(axis=-1)
-
-
-def normals(corners_m: Float[np.ndarray, "*markers 4 3"]) -> Float[np.ndarray, "*markers 3"]:
-    """Unit normals of markers, towards the side from which the corners are clockwise."""
-    across = np.cross(
-        corners_m[..., 3, :] - corners_m[..., 1, :], corners_m[..., 2, :] - corners_m[..., 0, :]
-    )
-    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
 
 
 def fit_square(points_m: Float[np.ndarray, "4 3"], side_m: float | None = None) -> PlacedMarker:
