@@ -30,11 +30,9 @@ from jaxtyping import UInt8
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.recordings import (
-    IMAGE_SUFFIXES,
     VideoInfo,
     frame_times,
     is_picture_folder,
-    open_pictures,
     open_video,
     read_frames,
     read_grey,
@@ -131,18 +129,13 @@ def open_source(source: Path | str, *, fps: float | None = None, live: bool = Fa
     if live or "://" in str(source):
         return _stream(str(source), fps, live)
     path = Path(source)
-    if path.is_dir():
-        if fps is None and is_picture_folder(path):
-            raise SettingsError(
-                "--fps",
-                expected=f"the rate at which the images in {path} were taken, because images do not state it",
-                found="no --fps",
-                remedy="add it in frames per second, such as --fps 25",
-            )
-        return _recorded(open_pictures(path, fps))
-    if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
-        remedy = "name the images' folder, and pass --fps"
-        raise InputError(path, expected="a video, or a folder of images", found="one image", remedy=remedy)
+    if fps is None and is_picture_folder(path):
+        raise SettingsError(
+            "--fps",
+            expected=f"the rate at which the images in {path} were taken, because images do not state it",
+            found="no --fps",
+            remedy="add it in frames per second, such as --fps 25",
+        )
     return _recorded(open_video(path, fps))
 
 
