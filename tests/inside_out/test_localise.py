@@ -31,6 +31,7 @@ from psotrack.inside_out import (
     Flag,
     LocaliseSettings,
     MarkerMap,
+    filtering,
     localise_video,
     open_source,
     read_camera_path,
@@ -375,11 +376,11 @@ def test_a_mirrored_marker_and_a_shuffled_map_end_in_lost_frames():
     assert not path_of(frames, shuffled)[0].seen.any()
 
 
-@pytest.mark.parametrize("stage", ["estimate_pose", "step"])
-def test_a_frame_without_a_solution_ends_nothing(stage, monkeypatch):
+@pytest.mark.parametrize(("module", "stage"), [(frame_poses, "estimate_pose"), (filtering, "step")])
+def test_a_frame_without_a_solution_ends_nothing(module, stage, monkeypatch):
     """A singular matrix in one frame: the frame has no pose, or the filter starts anew; the others are answered."""
     frames, centres_m = fly_past(12)
-    working, calls = getattr(frame_poses, stage), []
+    working, calls = getattr(module, stage), []
 
     def once_singular(*arguments, **options):
         calls.append(1)
@@ -387,7 +388,7 @@ def test_a_frame_without_a_solution_ends_nothing(stage, monkeypatch):
             raise np.linalg.LinAlgError("Singular matrix")
         return working(*arguments, **options)
 
-    monkeypatch.setattr(frame_poses, stage, once_singular)
+    monkeypatch.setattr(module, stage, once_singular)
     found_m = off_m(path_of(frames, ROOM)[0], centres_m)
     assert np.isfinite(np.delete(found_m, 5)).all()
     assert np.nanmax(found_m) < 0.1

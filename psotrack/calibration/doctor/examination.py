@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.calibration.doctor import diagnosis
 from psotrack.calibration.doctor.common_points import (
     CommonPoints,
     Corrected,
@@ -24,15 +25,7 @@ from psotrack.calibration.doctor.common_points import (
     misfit_px,
     weigh,
 )
-from psotrack.calibration.doctor.diagnosis import (
-    Diagnosis,
-    Finding,
-    describe_disagreement,
-    describe_fault,
-    describe_gross_fault,
-    describe_knock,
-    describe_reference,
-)
+from psotrack.calibration.doctor.diagnosis import Diagnosis, Finding
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
 from psotrack.geometry import Rig, project_visible
@@ -126,7 +119,7 @@ def examine(
         knock = _find_knock(rig, seen, data)
         if knock is not None:
             both = rig.names if seen.viewpoints(rig) < 3 else (rig.names[knock.camera],)
-            findings.append(describe_knock(both, knock, fps))
+            findings.append(diagnosis.describe_knock(both, knock, fps))
             sound = seen.without(knock)
             points = sound.common_points(rig)
             data = weigh(as_read, points)
@@ -135,11 +128,11 @@ def examine(
         findings += found
         unexplained = off_std > NEAR_STD or not (findings or explained.sum() >= MIN_SHARE * total)
         if unexplained and all(finding.kind != "unclear" for finding in found):
-            share = explained.sum() / total
-            findings.append(describe_disagreement(share, total, seen.viewpoints(rig), off_std, name))
+            share, least = explained.sum() / total, seen.viewpoints(rig)
+            findings.append(diagnosis.describe_disagreement(share, total, least, off_std, name))
         if reference is not None:
             inside = points.frame < reference.num_frames
-            reference_m, contradiction = describe_reference(
+            reference_m, contradiction = diagnosis.describe_reference(
                 points.start_m[inside], reference.position_m[points.frame[inside]]
             )
             findings += contradiction
@@ -202,7 +195,7 @@ def _find_faults(
             fault = find_fault(rest, data)
             if fault is None or (findings and not fault.certain):
                 break
-            finding, left = describe_fault(rest, fault, seen.fps), left.by(fault.best.step)
+            finding, left = diagnosis.describe_fault(rest, fault, seen.fps), left.by(fault.best.step)
             if seen.viewpoints(rest) < 3:
                 message = f"the cameras disagree, for example as if {finding.message}"
                 remedy = "two viewpoints do not show which camera is wrong: check both, or use more cameras"
@@ -251,7 +244,7 @@ def _gross_fault(rig: Rig, seen: ExaminedFrames, points: CommonPoints) -> Findin
         explained = float((np.linalg.norm(off_px, axis=-1) < NEAR_STD * noise_px).any(axis=1).mean())
         if explained < NOTHING_EXPLAINED:
             wrong.append((explained, rig.names[index]))
-    return describe_gross_fault(*min(wrong)) if wrong else None
+    return diagnosis.describe_gross_fault(*min(wrong)) if wrong else None
 
 
 def _check_numbers(rig: Rig, seen: ExaminedFrames) -> tuple[list[Finding], Rig]:
@@ -304,7 +297,7 @@ def _why_unknown(
         )
         return Finding("too little seen", (), message, remedy)
     if not agree:
-        return describe_disagreement(explained.sum() / total, total, seen.viewpoints(rig))
+        return diagnosis.describe_disagreement(explained.sum() / total, total, seen.viewpoints(rig))
     consistent = data.used.sum() / points.seen.sum()
     if consistent >= MIN_CONSISTENT:
         return None

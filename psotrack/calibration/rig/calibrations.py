@@ -14,16 +14,10 @@ from psotrack.calibration.board_recognition import describe_board, detect_board
 from psotrack.calibration.boards import Board
 from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.lens_models import known_lenses, lens_of_view, lenses_at_size, parse_lens_model
+from psotrack.calibration.rig import findings, point_files
+from psotrack.calibration.rig import views as board_views
 from psotrack.calibration.rig.adjustment import LensChoice, calibrate_rig, in_new_world, start_lenses
-from psotrack.calibration.rig.findings import (
-    PointFit,
-    RigCalibration,
-    result_of_board,
-    result_of_points,
-    say_print,
-    say_searched,
-    say_starts,
-)
+from psotrack.calibration.rig.findings import RigCalibration
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
     PointRig,
@@ -31,30 +25,9 @@ from psotrack.calibration.rig.moving_point import (
     calibrate_by_point,
     covariance_of_centres,
 )
-from psotrack.calibration.rig.point_files import (
-    distance_between,
-    find_markers,
-    fit_world,
-    read_image_points,
-    read_point_views,
-    read_world,
-    stick_length,
-    views_of_detections,
-    world_in_words,
-)
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.shifts import find_board_shifts, find_point_shifts
-from psotrack.calibration.rig.views import (
-    CameraImages,
-    FoundBoards,
-    Instants,
-    choose_instants,
-    find_views,
-    first_images,
-    instants_of_numbers,
-    open_images,
-    open_recorded,
-)
+from psotrack.calibration.rig.views import CameraImages, FoundBoards, Instants
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
 from psotrack.geometry import Rig, chosen_camera, make_rig
@@ -85,35 +58,35 @@ def calibrate_by_board(
         InputError: an image cannot be read, the board is not seen, or the views do not determine the rig.
         SettingsError: the settings do not say what the board is like, or do not fit the sources.
     """
-    given = None if settings.world is None else read_world(settings.world)
+    given = None if settings.world is None else point_files.read_world(settings.world)
     if len(sources) == 1 and is_recording(sources[0]):
-        cameras, instants = open_recorded(open_recording(sources[0]))
+        cameras, instants = board_views.open_recorded(open_recording(sources[0]))
     else:
-        cameras = open_images(sources, settings.names)
-        instants = instants_of_numbers(cameras)
+        cameras = board_views.open_images(sources, settings.names)
+        instants = board_views.instants_of_numbers(cameras)
     lenses, said = _lens_choice(settings, cameras), []
     if settings.squares is None:
-        stated = detect_board(settings.square_m or 0.0, first_images(cameras, 4))
+        stated = detect_board(settings.square_m or 0.0, board_views.first_images(cameras, 4))
         said.append(f"the board is {describe_board(stated)}")
         _logger.info("%s", said[0])
     else:
         stated = Board.of(settings)
     with errors_name(f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else sources[0]):
         found, lenses, shifts = _find_views(stated, cameras, instants, lenses, settings.floor, report)
-        said += say_searched(found)
-        said += say_starts(found.views.names, shifts)
+        said += findings.say_searched(found)
+        said += findings.say_starts(found.views.names, shifts)
         calibrated = calibrate_rig(found.board, found.views, lenses, floor=settings.floor, report=report)
     if given is not None:
         with errors_name(given.path):
-            change, left_m = fit_world(calibrated.rig, given, with_scale=False)
-        calibrated, place = in_new_world(calibrated, change), world_in_words(given.path, left_m)
+            change, left_m = point_files.fit_world(calibrated.rig, given, with_scale=False)
+        calibrated, place = in_new_world(calibrated, change), point_files.world_in_words(given.path, left_m)
     elif settings.floor is not None:
         place = f"the board in frame {settings.floor}: its first corner is the origin, z points up"
     else:
         first = calibrated.rig.names[0]
         place = f"camera {first}: x right, y down, z forward; --floor and --world place it elsewhere"
     begins = {name: -shift for name, shift in zip(found.views.names, shifts, strict=True)}
-    return result_of_board(calibrated, said, say_print(found), place, begins)
+    return findings.result_of_board(calibrated, said, findings.say_print(found), place, begins)
 
 
 def _find_views(
@@ -131,7 +104,8 @@ def _find_views(
     """
     shifts = np.zeros(len(cameras), np.int64)
     for _ in range(_MOST_ROUNDS):
-        found = find_views(board, cameras, choose_instants(instants, floor, shifts.tolist()), report)
+        chosen = board_views.choose_instants(instants, floor, shifts.tolist())
+        found = board_views.find_views(board, cameras, chosen, report)
         if lenses.start is None:
             lenses = replace(lenses, start=start_lenses(found.board, found.views, lenses, report))
         # A shift that is found between searched frames is looked at once more where it has these frames.
@@ -178,17 +152,17 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     lenses = _lenses_of(views.names, settings)
     with errors_name(sources[0]):
         found = calibrate_by_point(lenses, views)
-    given = None if settings.world is None else read_world(settings.world)
+    given = None if settings.world is None else point_files.read_world(settings.world)
 
     def world_of(found: PointRig) -> tuple[Similarity, str]:
         rig = found.rig
         if given is not None:
-            change, left_m = fit_world(rig, given, _numbered(found), with_scale=True)
-            return change, world_in_words(given.path, left_m)
+            change, left_m = point_files.fit_world(rig, given, _numbered(found), with_scale=True)
+            return change, point_files.world_in_words(given.path, left_m)
         factor = (
-            (stick_m or 1.0) / stick_length(found)
+            (stick_m or 1.0) / point_files.stick_length(found)
             if distance is None
-            else distance[2] / distance_between(rig, *distance[:2])
+            else distance[2] / point_files.distance_between(rig, *distance[:2])
         )
         words = f"camera {rig.names[0]}: x right, y down, z forward; --world places it elsewhere"
         return world_of_camera(rig, 0, factor), words
@@ -200,10 +174,12 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     for index, name in enumerate(rig.names):
         seen = np.isfinite(found.residual_px[:, index])
         residual_px, used = found.residual_px[seen, index], found.used[seen, index]
-        fits[name] = PointFit(found.views.number[seen].tolist(), covariance_m2[index], residual_px, used)
+        fits[name] = findings.PointFit(
+            found.views.number[seen].tolist(), covariance_m2[index], residual_px, used
+        )
     shifts = map(str, find_point_shifts(found.rig, views))
     notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
-    return result_of_points(rig, fits, notes)
+    return findings.result_of_points(rig, fits, notes)
 
 
 def calibrate_by_known_points(
@@ -230,15 +206,17 @@ def calibrate_by_known_points(
         if len(sources) == 1 and is_recording(sources[0]):
             videos = open_recording(sources[0]).videos
         else:
-            videos = {camera.name: camera.video for camera in open_images(sources, settings.names)}
+            opened = board_views.open_images(sources, settings.names)
+            videos = {camera.name: camera.video for camera in opened}
         sizes_wh = {name: video.image_size_wh for name, video in videos.items()}
         marks = {
-            name: find_markers(video, marker_corners_m, settings.dictionary) for name, video in videos.items()
+            name: point_files.find_markers(video, marker_corners_m, settings.dictionary)
+            for name, video in videos.items()
         }
     elif sources:
         raise SettingsError("--pairs", expected="no video", found=f"{sources[0]}")
     else:
-        marks = read_image_points(settings.pairs or "", settings.places)
+        marks = point_files.read_image_points(settings.pairs or "", settings.places)
     lenses, world = _lenses_of(tuple(marks), settings, sizes_wh), settings.pairs or settings.markers
     cameras, fits, notes = {}, {}, [f"the world is that of {world}"]
     for index, (name, mark) in enumerate(marks.items()):
@@ -249,13 +227,13 @@ def calibrate_by_known_points(
             )
         cameras[name] = replace(lens, T_cam_world=located.T_cam_world)
         covariance_m2 = located.centre_covariance_m2
-        fits[name] = PointFit(mark.points, covariance_m2, located.residual_px, located.used)
+        fits[name] = findings.PointFit(mark.points, covariance_m2, located.residual_px, located.used)
         if located.lens_shift_m:
             notes.append(
                 f"the residuals of {name} are not noise: another lens explains them, and has the camera "
                 f"{1e3 * located.lens_shift_m:.0f} mm away, which its standard deviation contains; calibrate its lens"
             )
-    return result_of_points(make_rig(cameras), fits, notes)
+    return findings.result_of_points(make_rig(cameras), fits, notes)
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
@@ -337,7 +315,7 @@ def _read_views(sources: Sequence[Path]) -> PointViews:
         expected = "one recording or one CSV file"
         raise SettingsError("--points", expected=expected, found=f"{len(sources)} paths")
     if sources[0].suffix.lower() == ".csv":
-        return read_point_views(sources[0])
+        return point_files.read_point_views(sources[0])
     recording = open_recording(sources[0])
     if not recording.detections:
         raise InputError(sources[0], expected="detections of a moving point", found="none")
@@ -345,4 +323,4 @@ def _read_views(sources: Sequence[Path]) -> PointViews:
     times = {each.name: each.times for each in recording.cameras if each.times}
     line_time_s = {each.name: each.line_time_s for each in recording.cameras}
     with errors_name(sources[0]):
-        return views_of_detections(boxes, times, line_time_s)
+        return point_files.views_of_detections(boxes, times, line_time_s)

@@ -20,18 +20,8 @@ from scipy.special import chdtri, gammaln
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath, Flag
-from psotrack.inside_out.filtering.motion import (
-    ACCELERATION_TIME_S,
-    Agility,
-    Motion,
-    MotionEstimate,
-    correct,
-    estimate,
-    initial_motion,
-    innovation,
-    predict,
-    turning,
-)
+from psotrack.inside_out.filtering import motion as pose_motion
+from psotrack.inside_out.filtering.motion import Agility, Motion, MotionEstimate
 from psotrack.inside_out.pose import CameraPose
 from psotrack.trajectories import Status
 
@@ -134,7 +124,7 @@ class FilterRun:
 
     def agility_at(self, time_s: float, agility: Agility) -> Agility:
         """How wildly the track may move: as wildly as any drone for the acceleration's time constant after a turn."""
-        return _WILDEST if time_s - self.turned_s < ACCELERATION_TIME_S else agility
+        return _WILDEST if time_s - self.turned_s < pose_motion.ACCELERATION_TIME_S else agility
 
 
 @dataclass(frozen=True)
@@ -167,7 +157,8 @@ def expected(run: FilterRun, time_s: float, params: PoseFilterParams, agility: A
     used = track is not None and run.used and time_s == track.seen_s
     if track is None or not confirmed(run, params) or time_s - track.seen_s > params.longest_gap_s:
         return Estimated(None, used)
-    found = estimate(predict(track.motion, time_s - track.seen_s, run.agility_at(time_s, agility))[0])
+    later, _, _ = pose_motion.predict(track.motion, time_s - track.seen_s, run.agility_at(time_s, agility))
+    found = pose_motion.estimate(later)
     return Estimated(replace(found, covariance=found.covariance + track.constant), used, track.ambiguity)
 
 
@@ -209,7 +200,7 @@ def step(
     if accepts:
         return replace(run, track=updated.track, rival=None, used=True)
     if is_fresh:
-        anew = replace(track, motion=turning(track.motion, _WILDEST))
+        anew = replace(track, motion=pose_motion.turning(track.motion, _WILDEST))
         turned = _updated(anew, time_s, pose, params, _WILDEST)
         if turned.fits and _is_predicted(turned) and confirmed(run, params):
             turn = replace(turned.track, began_s=time_s)
@@ -238,7 +229,7 @@ def _rivalled(run: FilterRun, rival: Track, needed: int, turns: bool) -> FilterR
 
 def _first_track(time_s: float, pose: CameraPose, agility: Agility) -> Track:
     """The track of a single pose."""
-    motion = initial_motion(pose, agility)
+    motion = pose_motion.initial_motion(pose, agility)
     return Track(motion, time_s, time_s, 1, pose.ambiguity, _is_sure(pose), pose.constant)
 
 
@@ -256,14 +247,14 @@ def _updated(
     degrees of freedom exceeds with probability `_FALSE_ALARM`. An ambiguous pose is weighted by the probability that it
     is the right one, given how well it fits.
     """
-    predicted, _, _ = predict(track.motion, time_s - track.seen_s, agility)
-    found = innovation(predicted, pose)
+    predicted, _, _ = pose_motion.predict(track.motion, time_s - track.seen_s, agility)
+    found = pose_motion.innovation(predicted, pose)
     spread = found.covariance + pose.constant
     nis, log_size = float(found.off @ np.linalg.solve(spread, found.off)), float(np.linalg.slogdet(spread)[1])
     robust = _LOG_PEAK - ((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
     right = probability_right(found.off, spread, pose.ambiguity)
     more = Track(
-        correct(predicted, found, right),
+        pose_motion.correct(predicted, found, right),
         track.began_s,
         time_s,
         track.support + 1,

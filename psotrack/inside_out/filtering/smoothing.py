@@ -16,18 +16,9 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
+from psotrack.inside_out.filtering import pose_filter
 from psotrack.inside_out.filtering.motion import Agility, Motion
-from psotrack.inside_out.filtering.pose_filter import (
-    Estimated,
-    FilterRun,
-    PoseFilterParams,
-    confirmed,
-    expected,
-    path_of,
-    poses_of,
-    probability_right,
-    step,
-)
+from psotrack.inside_out.filtering.pose_filter import Estimated, FilterRun, PoseFilterParams
 from psotrack.inside_out.pose import CameraPose
 
 #: Factor between neighbouring values, and largest number of steps from the defaults: accelerations from 0.05 to
@@ -67,7 +58,7 @@ def choose_agility(
         for window in windows:
             run = FilterRun()
             for at_s, pose in window:
-                run = step(run, float(at_s), pose, params, _agility(along, about))
+                run = pose_filter.step(run, float(at_s), pose, params, _agility(along, about))
             total += run.log_likelihood
         return total
 
@@ -123,13 +114,13 @@ def filter_path(
     Raises:
         InputError: a pose's covariance is not positive definite.
     """
-    params, poses = params or PoseFilterParams(), poses_of(path, constant)
+    params, poses = params or PoseFilterParams(), pose_filter.poses_of(path, constant)
     agility = choose_agility(path.time_s.tolist(), poses, params)
     run, estimates = FilterRun(), []
     for time_s, pose in zip(path.time_s.tolist(), poses, strict=True):
-        run = step(run, time_s, pose, params, agility)
-        estimates.append(expected(run, time_s, params, agility))
-    return path_of(path, estimates)
+        run = pose_filter.step(run, time_s, pose, params, agility)
+        estimates.append(pose_filter.expected(run, time_s, params, agility))
+    return pose_filter.path_of(path, estimates)
 
 
 def smooth(
@@ -148,8 +139,9 @@ def smooth(
     Raises:
         InputError: a pose's covariance is not positive definite.
     """
-    return path_of(
-        path, smoothed_motions(path.time_s, poses_of(path, constant), params or PoseFilterParams())
+    return pose_filter.path_of(
+        path,
+        smoothed_motions(path.time_s, pose_filter.poses_of(path, constant), params or PoseFilterParams()),
     )
 
 
@@ -189,7 +181,7 @@ def _findings(
     agilities = [agility] * count
     has_pose, run, good = np.array([pose is not None for pose in poses], bool), FilterRun(), [False]
     for k, pose in enumerate(poses):
-        run = step(run, float(time_s[k]), pose, params, agility)
+        run = pose_filter.step(run, float(time_s[k]), pose, params, agility)
         fits[k] = run.used
         if run.restarted_s is not None:
             # The poses of a rival track were gated when they came.
@@ -200,7 +192,7 @@ def _findings(
                 track[since:k] = len(good) - 1
             agilities[since:k] = [run.agility_at(run.restarted_s, agility)] * (k - since)
         agilities[k] = run.agility_at(float(time_s[k]), agility)
-        track[k], good[-1] = len(good) - 1, confirmed(run, params)
+        track[k], good[-1] = len(good) - 1, pose_filter.confirmed(run, params)
         if run.track is not None:
             ambiguity[k] = run.track.ambiguity
     return _Findings(fits & np.array(good)[track], track, ambiguity, agilities)
@@ -243,7 +235,7 @@ def _smooth_span(
         motion = ahead[-1][0]
         if pose is not None:
             found = pose_motion.innovation(motion, pose)
-            right = probability_right(found.off, found.covariance + pose.constant, pose.ambiguity)
+            right = pose_filter.probability_right(found.off, found.covariance + pose.constant, pose.ambiguity)
             motion = pose_motion.correct(motion, found, right)
         filtered.append(motion)
     later = filtered[-1]

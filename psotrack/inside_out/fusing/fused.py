@@ -25,15 +25,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.evaluation import Offset, find_offset
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.fusing.weighting import (
-    Inside,
-    Point,
-    Weighted,
-    inside_at,
-    nearest_index,
-    outside_at,
-    weigh,
-)
+from psotrack.inside_out.fusing import weighting
+from psotrack.inside_out.fusing.weighting import Inside, Point, Weighted
 from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import GATE_M, UNASSIGNED, Status, Trajectories
 
@@ -74,7 +67,7 @@ def pair_tracks(
     for path in np.flatnonzero((near != UNASSIGNED).any(axis=0)):
         # Where no distance tells, the drone keeps its track, unless another drone has this track.
         rows = np.flatnonzero(near[:, path] != UNASSIGNED)
-        own = near[rows[nearest_index(rows, frames)], path]
+        own = near[rows[weighting.nearest_index(rows, frames)], path]
         is_free = (np.delete(near, path, axis=1) != own[:, None]).all(axis=1)
         both_m = distance_m[frames, path, own]
         both_m = both_m[np.isfinite(both_m)]
@@ -249,8 +242,10 @@ def fuse(
         raise InputError("outside tracks", expected="a position in at least one frame", found="none")
     offsets = {name: _find_clock_offset(name, path, outside, max_offset_s) for name, path in paths.items()}
     clocks_s = {name: 0.0 if offset is None else offset.offset_s for name, offset in offsets.items()}
-    tracks = outside_at(outside, [path.time_s[path.seen] - clocks_s[name] for name, path in paths.items()])
-    cameras = [inside_at(path, tracks.time_s, clocks_s[name]) for name, path in paths.items()]
+    tracks = weighting.outside_at(
+        outside, [path.time_s[path.seen] - clocks_s[name] for name, path in paths.items()]
+    )
+    cameras = [weighting.inside_at(path, tracks.time_s, clocks_s[name]) for name, path in paths.items()]
     tracked = np.asarray(tracks.status == Status.TRACKED)
     middle_m = np.where(tracked[..., None], tracks.position_m, np.nan)
     pairing = pair_tracks(np.stack([camera.position_m for camera in cameras], axis=1), middle_m)
@@ -263,11 +258,13 @@ def fuse(
         names = [tracks.drones[index] for index in own[own != UNASSIGNED]]
         if names:
             own_m = np.where((track["source"] == 2)[:, None], track["position_m"], np.nan)
-            weighted = weigh(camera, own_m, track["covariance_m2"], point)
+            weighted = weighting.weigh(camera, own_m, track["covariance_m2"], point)
             if weighted.gross[:, 0].any():
                 gross_s = tracks.time_s[weighted.gross[:, 0]] + clocks_s[name]
-                camera = inside_at(_without_poses(paths[name], gross_s), tracks.time_s, clocks_s[name])
-                again = weigh(camera, own_m, track["covariance_m2"], point)
+                camera = weighting.inside_at(
+                    _without_poses(paths[name], gross_s), tracks.time_s, clocks_s[name]
+                )
+                again = weighting.weigh(camera, own_m, track["covariance_m2"], point)
                 weighted = replace(again, gross=again.gross | weighted.gross)
         rows[name] = _fused_rows(camera, weighted, track["velocity_m_s"], point)
         both, one, other = (int((rows[name]["source"] == which).sum()) for which in (3, 1, 2))
@@ -358,7 +355,7 @@ def _outside_rows(tracks: Trajectories, index: Int[np.ndarray, "frames"]) -> _Ro
 def _without_poses(path: CameraPath, gross_s: Float[np.ndarray, "rows"]) -> CameraPath:
     """The path without the poses nearest to some times."""
     status = path.status.copy()
-    status[nearest_index(path.time_s, gross_s)] = Status.LOST
+    status[weighting.nearest_index(path.time_s, gross_s)] = Status.LOST
     return replace(path, status=status)
 
 

@@ -16,20 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
+from psotrack.inside_out import filtering
 from psotrack.inside_out.camera_path import CameraPath, Flag
-from psotrack.inside_out.filtering import (
-    Agility,
-    Estimated,
-    FilterRun,
-    MotionEstimate,
-    PoseFilterParams,
-    choose_agility,
-    expected,
-    filled,
-    orientations,
-    smooth,
-    step,
-)
+from psotrack.inside_out.filtering import Agility, Estimated, FilterRun, MotionEstimate, PoseFilterParams
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import CameraPose, MarkerPose, PoseSettings, estimate_pose
 from psotrack.inside_out.rolling_shutter import (
@@ -106,7 +95,7 @@ class LocalisedVideo:
 
     def smoothed(self, params: PoseFilterParams | None = None) -> CameraPath:
         """The path with every pose estimated from all frames."""
-        return smooth(self.raw, params, self.constant)
+        return filtering.smooth(self.raw, params, self.constant)
 
     @property
     def frames_per_second(self) -> float:
@@ -198,7 +187,7 @@ class Localiser:
         model, run, recent = agility or Agility(), FilterRun(), list[tuple[float, CameraPose]]()
         for number, time_s, markers in detected:
             began_s = time.perf_counter()
-            predicted = expected(run, time_s, params, model).motion
+            predicted = filtering.expected(run, time_s, params, model).motion
             predicted_s = time.perf_counter()
             corners_m = self.marker_map.corners_of(markers.ids.tolist())
             rows = SeenRows(markers.corners_px, corners_m, self.lens, time_s)
@@ -213,7 +202,7 @@ class Localiser:
                     pose = _with_rows(pose, rows, shutter, motion)
                     if turn < _TURNS - 1 and around is None:
                         trial = _stepped(run, time_s, pose, params, model)
-                        now = expected(trial, time_s, params, model)
+                        now = filtering.expected(trial, time_s, params, model)
                         motion = _constant(now.motion, time_s) or motion
             located_s = time.perf_counter()
             run = _stepped(run, time_s, pose, params, model)
@@ -221,12 +210,14 @@ class Localiser:
                 recent.append((time_s, pose))
                 if len(recent) in _CHOICES:
                     times_s, poses = zip(*recent, strict=True)
-                    model, run = choose_agility(times_s, poses, params), FilterRun()
+                    model, run = filtering.choose_agility(times_s, poses, params), FilterRun()
                     for earlier_s, earlier in recent:
                         run = _stepped(run, earlier_s, earlier, params, model)
             self.seconds["locate"] += located_s - predicted_s
             self.seconds["filter"] += time.perf_counter() - located_s + predicted_s - began_s
-            yield FollowedFrame(number, time_s, len(markers), pose, expected(run, time_s, params, model))
+            yield FollowedFrame(
+                number, time_s, len(markers), pose, filtering.expected(run, time_s, params, model)
+            )
 
     def _own_pose(
         self,
@@ -254,7 +245,7 @@ def _stepped(
     run: FilterRun, time_s: float, own: CameraPose | None, params: PoseFilterParams, agility: Agility
 ) -> FilterRun:
     try:
-        return step(run, time_s, own, params, agility)
+        return filtering.step(run, time_s, own, params, agility)
     except np.linalg.LinAlgError:
         # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
         return FilterRun()
@@ -265,18 +256,18 @@ def own_path(frames: Sequence[FollowedFrame], settings: PoseSettings) -> CameraP
     poses = [frame.pose for frame in frames]
     there = np.array([pose is not None for pose in poses], bool)
     seen = np.array([frame.num_markers for frame in frames], int)
-    num_markers = np.where(there, filled(poses, "num_markers"), seen).astype(int)
-    ambiguity = filled(poses, "ambiguity")
+    num_markers = np.where(there, filtering.filled(poses, "num_markers"), seen).astype(int)
+    ambiguity = filtering.filled(poses, "ambiguity")
     few = (num_markers > 0) & (num_markers < max(PAPER_MARKERS, settings.min_markers))
     flags = np.where(few, int(Flag.FEW_MARKERS), 0)
     return CameraPath(
         frame=np.array([frame.number for frame in frames], int),
         time_s=np.array([frame.time_s for frame in frames], float),
-        position_m=filled(poses, "position_m", 3),
-        orientation_wxyz=orientations(poses),
-        covariance=filled(poses, "covariance", 6, 6),
+        position_m=filtering.filled(poses, "position_m", 3),
+        orientation_wxyz=filtering.orientations(poses),
+        covariance=filtering.filled(poses, "covariance", 6, 6),
         num_markers=num_markers,
-        reprojection_px=filled(poses, "reprojection_px"),
+        reprojection_px=filtering.filled(poses, "reprojection_px"),
         ambiguity=ambiguity,
         status=np.where(there, int(Status.TRACKED), int(Status.LOST)),
         flags=flags | np.where(ambiguity > _AMBIGUOUS, int(Flag.AMBIGUOUS), 0),
@@ -321,7 +312,7 @@ def _with_rows(
     by_motion = by_rates(shutter.line_time_s)
     squares, products = equations.products(by_motion)
     spread, of_motion = np.linalg.inv(np.eye(6) + squares), gain @ by_motion.reshape(-1, 6)
-    step = -of_motion @ spread @ products
+    change = -of_motion @ spread @ products
     by_line_time = by_rates(shutter.std_s).reshape(-1, 6)
     if motion is not None and shutter.std_s:
         line_times_s = shutter.line_time_s, shutter.line_time_s + shutter.std_s
@@ -330,8 +321,8 @@ def _with_rows(
     constant = (gain @ by_line_time) @ (gain @ by_line_time).T
     return replace(
         pose,
-        position_m=pose.position_m + step[:3],
-        R_world_cam=pose.R_world_cam @ Rotation.from_rotvec(step[3:6]).as_matrix(),
+        position_m=pose.position_m + change[:3],
+        R_world_cam=pose.R_world_cam @ Rotation.from_rotvec(change[3:6]).as_matrix(),
         covariance=pose.covariance + of_motion @ spread @ of_motion.T + constant,
         constant=pose.constant + constant,
     )

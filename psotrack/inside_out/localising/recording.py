@@ -21,14 +21,8 @@ from psotrack.errors import InputError
 from psotrack.foreground.markers import MarkerDetector
 from psotrack.foreground.silhouettes import FrameChanges, repeated_frames
 from psotrack.geometry import Camera
-from psotrack.inside_out.filtering import (
-    Agility,
-    PoseFilterParams,
-    filled,
-    filter_path,
-    path_of,
-    smoothed_motions,
-)
+from psotrack.inside_out import filtering
+from psotrack.inside_out.filtering import Agility, PoseFilterParams
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.lens_files import check_size
 from psotrack.inside_out.localising.frame_poses import (
@@ -145,10 +139,14 @@ def _localised(found: Sequence[FollowedFrame], localiser: Localiser, *, anew: bo
     """The paths of frames; filtered anew with the agility of all frames, or as they were estimated."""
     settings = localiser.settings
     path = raw = own_path(found, settings.pose)
-    constant = np.nan_to_num(filled([frame.pose for frame in found], "constant", 6, 6))
+    constant = np.nan_to_num(filtering.filled([frame.pose for frame in found], "constant", 6, 6))
     if settings.filter is not None:
         estimated = [frame.estimated for frame in found]
-        path = filter_path(raw, settings.filter, constant) if anew else path_of(raw, estimated)
+        path = (
+            filtering.filter_path(raw, settings.filter, constant)
+            if anew
+            else filtering.path_of(raw, estimated)
+        )
     return LocalisedVideo(path, raw, constant, localiser.shutter, localiser.marker_map)
 
 
@@ -157,7 +155,7 @@ def _motions_around(
 ) -> Callable[[float], MotionAround | None]:
     """The motion around each frame, by splines through the smoothed poses."""
     times = np.array([frame.time_s for frame in found])
-    smoothed = smoothed_motions(times, [frame.pose for frame in found], params)
+    smoothed = filtering.smoothed_motions(times, [frame.pose for frame in found], params)
     known = {time_s: one.motion for time_s, one in zip(times.tolist(), smoothed, strict=True) if one.motion}
     if not known:
         return lambda time_s: None
