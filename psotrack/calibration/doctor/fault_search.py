@@ -56,17 +56,18 @@ _PRIOR_FACTORS = (0.1, 0.3, 1.0, 3.0)
 #: Standard deviations of the parameters: turns, degrees; ways, as a fraction of the distance of the bodies; logarithm
 #: of the focal length; lag of a video, frames.
 _TURN_DEG, _WAY, _ZOOM, _LAG_FRAMES = 0.7, 0.02, 0.03, 1.5
-#: Parameters of the faults of one camera.
-_PARTS = {
-    "turned": (0, 1, 2),
-    "moved": (3, 4, 5),
-    "turned and moved": (0, 1, 2, 3, 4, 5),
-    "focal length": (6,),
-    "clock": (7,),
+#: Faults of one camera: their parameters, and the logarithm of their prior probability relative to the others: who
+#: pushes a camera turns it.
+_FAULTS = {
+    "turned": ((0, 1, 2), 0.0),
+    "moved": ((3, 4, 5), -0.5),
+    "turned and moved": ((0, 1, 2, 3, 4, 5), -2.0),
+    "focal length": ((6,), 0.0),
+    "clock": ((7,), 0.0),
 }
-#: Logarithms of the prior probabilities of rarer kinds, relative to the others: who pushes a camera turns it, and the
-#: perspective of extended bodies and boxes that merge look a little like a fault of all lenses.
-_LOG_PRIOR = {"moved": -0.5, "turned and moved": -2.0, "several": -7.0, "focal lengths": -7.0}
+#: The same logarithm of faults of all cameras: the perspective of extended bodies and boxes that merge look a little
+#: like a fault of all lenses.
+_OF_ALL = -7.0
 #: Logarithms of ratios of likelihoods that are very strong and strong evidence (R. Kass & A. Raftery, Bayes factors,
 #: 1995, section 3.2): a fault needs the first over a sound rig and over other kinds of fault, the second over faults of
 #: other cameras.
@@ -97,11 +98,13 @@ class Hypothesis:
             for all lenses together; clocks for all videos.
         camera: index of the camera; -1 for all cameras.
         columns: indices of the parameters among those of the whole rig.
+        log_prior: logarithm of its prior probability relative to that of other faults.
     """
 
     kind: str
     camera: int
     columns: tuple[int, ...]
+    log_prior: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -169,22 +172,19 @@ class Evidence:
         _, change, std[columns] = found[int(logs.argmax())]
         step[columns] += change
         log_odds = float(logsumexp(logs)) - np.log(len(_PRIOR_FACTORS)) - as_sound
-        return Judged(hypothesis, log_odds + _LOG_PRIOR.get(hypothesis.kind, 0.0), step, std)
+        return Judged(hypothesis, log_odds + hypothesis.log_prior, step, std)
 
 
 def list_hypotheses(num_cameras: int, cameras: Sequence[int]) -> list[Hypothesis]:
     """All hypotheses about some cameras of a rig, and those about all of them together."""
     found = [
-        Hypothesis(kind, camera, tuple(PER_CAMERA * camera + part for part in parts))
+        Hypothesis(kind, camera, tuple(PER_CAMERA * camera + part for part in parts), log_prior)
         for camera in cameras
-        for kind, parts in _PARTS.items()
+        for kind, (parts, log_prior) in _FAULTS.items()
     ]
-    turns = tuple(PER_CAMERA * camera + part for camera in cameras for part in _PARTS["turned"])
-    return [
-        *found,
-        Hypothesis("several", -1, turns),
-        Hypothesis("focal lengths", -1, (PER_CAMERA * num_cameras,)),
-    ]
+    turns = tuple(column for one in found if one.kind == "turned" for column in one.columns)
+    of_lenses = Hypothesis("focal lengths", -1, (PER_CAMERA * num_cameras,), _OF_ALL)
+    return [*found, Hypothesis("several", -1, turns, _OF_ALL), of_lenses]
 
 
 def gather(corrected: Corrected, data: WeightedPoints) -> Evidence:
