@@ -1,7 +1,9 @@
-"""A rig from nothing: lenses and places of several cameras, from views of a board that is moved before them.
+"""Lenses and places of several cameras, from a board or points that they see.
 
-In: images or videos of all cameras (`images`). Out: a `CalibratedRig` with covariances. `views` finds the corners of
-the board, `lenses` finds a first lens of each camera, `chain` joins the cameras through the views that they share,
-`adjustment` adjusts lenses, cameras and boards together and says how certain the rig is, and `findings` says what to
-do. Without a board, `moving_point` places the cameras. `shifts` names cameras whose frames are counted wrongly.
+In: images or videos of all cameras, or points in them. Out: a `RigCalibration`, with covariances of the cameras.
+`views` finds the corners of the board, `start` a first lens of each camera and the cameras' places through the views
+that they share, and `adjustment` adjusts lenses, cameras and boards together and says how certain the rig is.
+`moving_point` does the same for a point that moves, and `point_files` reads points and what fixes the world. `shifts`
+names cameras whose frames are counted wrongly, `calibrations` has the three ways as a whole, and `findings` says what
+came out and what to do.
 """

@@ -1,7 +1,7 @@
 """Lenses and places of all cameras, and the board's place at each instant, in one adjustment.
 
-First each camera's lens alone (`lenses`), then the cameras' places through the views that they share (`chain`),
-then all together: with a robust loss to find the places, and with squared residuals without outliers.
+First each camera's lens alone, then the cameras' places through the views that they share (`start`), then all
+together: with a robust loss to find the places, and with squared residuals without outliers.
 
 **Slips.** The corners of a view agree with each other far better than with the corners of other cameras, if the board
 moves and the cameras are not exactly synchronous. So each view has its own slip, a turn and a shift of the board, from
