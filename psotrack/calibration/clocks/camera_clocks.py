@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import correlate1d
 
 from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import (
@@ -251,18 +252,19 @@ def _fit_velocities(
         spread_m2: (frames, drones), variances of the points, square metres; infinite where there is no point.
         reach: number of frames before and after a frame through which the line is fitted.
     """
-    num_frames = len(point_m)
-    around = ((reach, reach), (0, 0))
-    padded_m = np.pad(np.nan_to_num(point_m), (*around, (0, 0)))
-    weight = np.pad(1 / spread_m2, around)
     steps = np.arange(-reach, reach + 1.0)
-    rows = np.arange(num_frames)[:, None] + np.arange(len(steps))
-    total, first, second = (np.einsum("fwd,w->fd", weight[rows], steps**power) for power in (0, 1, 2))
+
+    def around(values: np.ndarray, power: int) -> np.ndarray:
+        """Sums of values over the frames near each frame, times a power of their distance in time."""
+        return correlate1d(values, steps**power, axis=0, mode="constant")
+
+    weight = 1 / spread_m2
+    weighted_m = weight[..., None] * np.nan_to_num(point_m)
+    total, first, second = (around(weight, power) for power in (0, 1, 2))
     # The weighted mean time of each window, and the weighted sum of squares about this mean.
     middle = first / np.maximum(total, 1e-300)
     squares = second - first * middle
-    pull = np.einsum("fwd,w,fwdi->fdi", weight[rows], steps, padded_m[rows])
-    pull -= middle[..., None] * np.einsum("fwd,fwdi->fdi", weight[rows], padded_m[rows])
+    pull = around(weighted_m, 1) - middle[..., None] * around(weighted_m, 0)
     known = squares > 1e-9 * np.maximum(second, 1e-300)
     squares = np.where(known, squares, 1.0)
     return np.where(known[..., None], pull / squares[..., None], 0.0), np.where(known, 1 / squares, np.inf)
