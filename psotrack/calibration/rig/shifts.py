@@ -23,6 +23,7 @@ from psotrack.calibration.rig.start import find_board_poses
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.geometry import Rig, project, triangulate_linearly, undistort
 from psotrack.support import similarity
+from psotrack.trajectories.resampling import interpolated
 
 #: Largest shift of a moving point that is looked for, instants: two seconds of 30 per second.
 _MOST_SHIFT = 60
@@ -151,11 +152,13 @@ def _motion_shift(
 ) -> tuple[float, int]:
     """What one motion leaves of another at the shift that explains it best, as a fraction of the motion; the shift."""
     step = int(np.median(np.diff(number)))
+    # Between searched frames the motion is interpolated, also over one at which the board is not seen.
+    second_at = interpolated(number.astype(np.float64), second_m, 2.0 * step)
     last = int(number[-1] - number[0])
     tried: dict[int, tuple[float, int]] = {}
 
     def best(shifts: Iterable[int]) -> int:
-        tried.update((shift, _left(first_m, _at(number, second_m, number + shift))) for shift in shifts)
+        tried.update((shift, _left(first_m, second_at(number + float(shift)))) for shift in shifts)
         least = max(_LEAST_SHARED, max(shared for _, shared in tried.values()) / 3)
         return min(tried, key=lambda shift: (tried[shift][1] < least, tried[shift][0]))
 
@@ -165,22 +168,6 @@ def _motion_shift(
     (left, shared), still = tried[shift], tried[0][0]
     is_certain = shared >= _LEAST_SHARED and left < min(_EXPLAINED, _BETTER * still)
     return (left, shift) if is_certain else (min(still, 1.0), 0)
-
-
-def _at(
-    number: Int[np.ndarray, " instants"],
-    points_m: Float[np.ndarray, "instants 2 3"],
-    wanted: Int[np.ndarray, " wanted"],
-) -> Float[np.ndarray, "wanted 2 3"]:
-    """Points at wanted numbers, linear between instants that follow each other; NaN where one of them is unknown."""
-    gap = np.diff(number)
-    row = (np.searchsorted(number, wanted, side="right") - 1).clip(0, max(len(number) - 2, 0))
-    part = ((wanted - number[row]) / gap[row])[:, None, None]
-    # Where nothing is interpolated the other instant does not count.
-    found = np.where(part == 0, points_m[row], (1 - part) * points_m[row] + part * points_m[row + 1])
-    found = np.where(part == 1, points_m[row + 1], found)
-    follow = (part == 0) | (part == 1) | (gap[row] <= 2 * np.median(gap))[:, None, None]
-    return np.where((part >= 0) & (part <= 1) & follow, found, np.nan)
 
 
 def _left(
