@@ -7,7 +7,6 @@ screens change, ghosts go, and hovering drones stay foreground.
 from __future__ import annotations
 
 import functools
-import itertools
 
 import cv2
 import numpy as np
@@ -255,31 +254,23 @@ class TestLiving:
         assert found >= 0.98 * len(frames)
         assert false_blobs <= 0.5 * len(frames)
 
-    @pytest.mark.parametrize("level", [80, 200])
-    def test_a_fast_ball_beside_a_person_is_found(self, level):
-        """Ten balls of 8 px fly at 20 px a frame, blurred over 18 px, past a person who walks.
+    def test_a_fast_body_beside_a_person_is_found(self):
+        """Ten bodies of 9 px fly at 20 px a frame, blurred over 18 px, past a person who walks.
 
-        Found: of such balls in a video, 7 of 17 and 4 of 9 were found; their soft ends were taken for those of clouds.
+        Found: of the balls in a video, 7 of 17 and 4 of 9 were found; their soft ends were taken for those of clouds.
         """
         rng = np.random.default_rng(2)
-        wall = np.dstack([110 + 60 * _smooth(rng, HEIGHT, WIDTH)] * 3)
-        frames, balls = [], []
-        for height, flown in itertools.product(rng.uniform(8, 40, 10), range(8)):
-            ball = np.array([10 + 20 * flown, height + flown**2 / 4])
-            open_shutter = np.zeros((HEIGHT, WIDTH))
-            for along_px in np.linspace(-9, 9, 13):
-                x, y = np.rint(16 * (ball + np.array([along_px, 0]))).astype(int).tolist()
-                open_shutter += cv2.circle(np.zeros((HEIGHT, WIDTH)), (x, y), 64, 1 / 13, -1, shift=4)
-            share = cv2.GaussianBlur(open_shutter, (0, 0), 0.7)[..., None]
-            image = wall * (1 - share) + level * share
-            left = 30 + len(frames)
-            image[68:, left : left + 18] = (60, 50, 90)
+        wall = np.dstack([55 + 60 * _smooth(rng, HEIGHT, WIDTH)] * 3)
+        path = [(10.0 + 20 * step, y) for y in rng.uniform(8, 40, 10) for step in range(8)]
+        frames = []
+        for x, y in path:
+            image = np.mean([_with_drone(wall, x + moved, y, 9)[0] for moved in range(-9, 10)], axis=0)
+            image[68:, 30 + len(frames) : 48 + len(frames)] = 60
             frames.append(_exposed(image, rng))
-            balls.append(ball)
         is_found = []
-        for mask, ball in zip(Living(SETTINGS).foreground(frames[::2], frames), balls, strict=True):
-            middle = cv2.connectedComponentsWithStats(mask)[3][1:]
-            is_found.append((np.linalg.norm(middle - ball, axis=1) < 6).any())
+        for mask, middle in zip(Living(SETTINGS).foreground(frames[::2], frames), path, strict=True):
+            off_px = cv2.connectedComponentsWithStats(mask)[3][1:] - middle
+            is_found.append((np.linalg.norm(off_px, axis=1) < 6).any())
         assert np.mean(is_found) >= 0.9
 
     def test_a_place_that_drones_cross_stays_calm(self):
@@ -355,12 +346,10 @@ _noise = np.random.default_rng(8)
 #: Frames -> what the camera shows instead of each: the brightness as a factor, or another picture.
 LOST_LIGHT = {
     "begins dark": {i: (i + 1) / 15 for i in range(15)},
-    "begins at 30 %": dict.fromkeys(range(25), 0.3),
     "nine black at first": dict.fromkeys(range(9), BLACK),
     "nine nearly black": {i: _noise.integers(0, 4, (HEIGHT, WIDTH, 3), np.uint8) for i in range(9)},
     "black for long": dict.fromkeys(range(30, 70), BLACK),
     "five black": dict.fromkeys(BURST, BLACK),
-    "one black": {60: BLACK},
     "blue": dict.fromkeys(BURST, BLUE),
     "white": dict.fromkeys(BURST, np.uint8([255, 255, 255])),
     "another picture": {i: _exposed(_room(_noise), _noise) for i in BURST},
