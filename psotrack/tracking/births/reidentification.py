@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
-from psotrack.geometry import Camera, in_images
 from psotrack.tracking.births.births import (
     RETURNED_FOUND,
     SPANS_M,
@@ -47,9 +46,6 @@ TURNED_PROBABILITY = 0.1
 #: Odds of a new drone against a lost drone where no new ones come, and of no drone if the candidate does not move. A
 #: candidate that is not sure waits for the frames that make it so, unless a lost drone is clearly more probable.
 NEW_ODDS, UNSURE_ODDS, NO_DRONE_ODDS = 0.1, 3.0, 10.0
-#: The same odds against a lost drone that flew out of the views, which it leaves within this time, seconds: what comes
-#: into the views then is as probably another one.
-NEW_ODDS_OUTSIDE, LEAVES_S = 1.0, 0.5
 #: Number of drones that are taken to have come before the first one did: Jeffreys' prior of a rate.
 CAME_BEFORE = 0.5
 #: New drones come where drones were found, and as far about it as a drone flies in this time: a few flights do not show
@@ -212,7 +208,6 @@ def reidentify(
     lost: LostTracks,
     limits: FlightLimits,
     *,
-    cameras: Camera | None = None,
     max_births: int | None = None,
 ) -> Int[np.ndarray, "candidates"]:
     """Assign candidates to lost drones with the largest total likelihood.
@@ -227,7 +222,6 @@ def reidentify(
         candidates: the candidates.
         lost: drones that may be found again.
         limits: where and how fast drones may fly.
-        cameras: the cameras, which show who flew out of their views; None where nobody could.
         max_births: largest number of new drones; None for any number. If it is 0, a candidate that moves is assigned to
             a lost drone even if that is unlikely.
 
@@ -235,10 +229,7 @@ def reidentify(
         (candidates,), a row of `lost`, or `NEW`, or `NO_DRONE`. Never new are a candidate that is not sure, one that
         does not move, and a slow one at a place where a drone stood still.
     """
-    count, is_out = len(lost.drone), np.zeros(len(lost.drone), bool)
-    if cameras is not None and lost.new_per_s:
-        is_out = in_images(cameras, lost.position_m + LEAVES_S * lost.velocity_m_s).sum(axis=-1) < 2
-    odds_of_new = np.where(is_out, NEW_ODDS_OUTSIDE, NEW_ODDS)
+    count = len(lost.drone)
     places_m = np.concatenate([lost.region_m, *(one.position_m[None] for one in candidates)])
     around_m = AROUND_S * SPEED_SHARE * limits.max_speed_m_s * np.array([[-1.0], [1.0]])
     low_m, high_m = np.clip(_box_m(places_m) + around_m, *limits.bounds_m)
@@ -258,7 +249,7 @@ def reidentify(
         for column in range(0 if is_ghost[row] else count):
             # What may be a ghost is no drone that was lost elsewhere.
             if not is_dying[row] or _may_have_stayed(candidate, lost, column, limits):
-                scores[row, column] = _log_likelihood(candidate, lost, column, odds_of_new, limits)
+                scores[row, column] = _log_likelihood(candidate, lost, column, limits)
     chosen = np.full(len(candidates), NO_DRONE)
     births = 0
     for row, column in zip(
@@ -284,7 +275,6 @@ def _log_likelihood(
     candidate: TrackCandidate,
     lost: LostTracks,
     row: int,
-    odds_of_new: Float[np.ndarray, "lost"],
     limits: FlightLimits,
 ) -> float:
     """Log likelihood of a lost drone being the candidate: a density over position, velocity and span."""
@@ -318,8 +308,7 @@ def _log_likelihood(
     num_flying = sum(
         not doubtful and not _stands(lost, each, limits) for each, doubtful in enumerate(lost.doubtful)
     )
-    odds = float(odds_of_new[row]) + lost.new_per_s * gap_s
-    log_flown -= np.log(odds / NEW_ODDS * max(num_flying, 1))
+    log_flown -= np.log((1 + lost.new_per_s * gap_s / NEW_ODDS) * max(num_flying, 1))
     log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, limits) else 0.0
     return max(log_stayed, log_flown) + log_span
 

@@ -23,9 +23,8 @@ _WINDOWS = (10, 20, 40, 80)
 _CLEAR = 6.0
 #: Least part of a step that the shortest window shows; part that all frames before and after show.
 _SUDDEN, _STAYS = 0.5, (0.75, 1 / 0.75)
-#: Largest change of the share of frames in which another camera sees the body, from one window to the next; largest
-#: length of both windows, in frames of the recording for each frame that the camera shows.
-_OTHERS_CHANGE, _DENSE = 0.2, 2.0
+#: Largest length of both windows, in frames of the recording for each frame that the camera shows.
+_DENSE = 2.0
 #: Smallest step, pixels of an image of 1920 columns: a calibration's own error.
 _LEAST_PX = 1.5
 #: Median of a squared length of two components of variance 1 (χ² distribution).
@@ -67,7 +66,7 @@ def find_knock(parts: Iterable[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]) ->
 
 
 #: Frames in which a camera shows something, what they tell of a shift of its places, as equations [left | right], and
-#: the share of the bodies that each camera shows in them.
+#: the number of bodies that each camera shows in them.
 _Told = tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"], Float[np.ndarray, "frames cameras"]]
 
 
@@ -89,12 +88,12 @@ def _against_others(places: FittedPlaces, frame: Int[np.ndarray, "rows"], camera
     solved = J @ np.linalg.inv(normal)
     left = np.eye(2) - solved @ J.swapaxes(-1, -2)
     rest_px = used.residual_px[:, camera] - np.matvec(solved, right)
-    frames, number, count = np.unique(frame[rows], return_inverse=True, return_counts=True)
+    frames, number = np.unique(frame[rows], return_inverse=True)
     equations = np.zeros((len(frames), 2, 3))
     np.add.at(equations, number, np.concatenate([left, rest_px[..., None]], axis=-1))
     shown = np.zeros((len(frames), used.shown.shape[1]))
     np.add.at(shown, number, weight)
-    return frames, equations, shown / count[:, None]
+    return frames, equations, shown
 
 
 def _steps(
@@ -104,7 +103,6 @@ def _steps(
     shown: Float[np.ndarray, "frames cameras"],
 ) -> Iterator[Knock]:
     """The clearest step of a camera, by each length of the windows, if it is one."""
-    shown_so_far = np.concatenate([np.zeros((1, shown.shape[1])), np.cumsum(shown, axis=0)])
     total = np.concatenate([np.zeros((1, 2, 3)), np.cumsum(equations, axis=0)])
     _, sets = np.unique(shown > 0, axis=0, return_inverse=True)
     for window in _WINDOWS:
@@ -113,10 +111,8 @@ def _steps(
         first = np.arange(window, len(frames) - window + 1)
         change_px, clear = _change(total[first] - total[first - window], total[first + window] - total[first])
         usual = np.sqrt(np.median(clear) / _CHI2_MEDIAN)
-        before, after = (shown_so_far[stop] - shown_so_far[stop - window] for stop in (first, first + window))
-        alike = (np.abs(after - before) <= _OTHERS_CHANGE * window).all(axis=1)
-        alike &= frames[first + window - 1] - frames[first - window] <= _DENSE * 2 * window
-        best = int(np.where(alike, clear, 0.0).argmax())
+        dense = frames[first + window - 1] - frames[first - window] <= _DENSE * 2 * window
+        best = int(np.where(dense, clear, 0.0).argmax())
         at = first[best]
         shortest = total[at] - total[at - _WINDOWS[0] // 2], total[at + _WINDOWS[0] // 2] - total[at]
         length2, sudden = (

@@ -277,7 +277,7 @@ class _Tracker:
         count, known = self._settings.drones.count, len(self._drones)
         lost = self._history.lost(known, frame, self._limits.fps, counted=count is not None)
         most = None if count is None else max(count - known, 0)
-        assignment = reidentify(candidates, lost, self._limits, cameras=self._cameras, max_births=most)
+        assignment = reidentify(candidates, lost, self._limits, max_births=most)
         begun = [each for each in zip(candidates, assignment.tolist(), strict=True) if each[1] != NO_DRONE]
         self._births.take(candidate for candidate, _ in begun)
         for candidate, row in begun:

@@ -307,8 +307,7 @@ class SwarmRun:
             return []
         lost, known = self._lost(block, rows), self.known
         most = None if self._most is None else max(self._most - len(known), 0)
-        cameras = self._setting.rig.cameras
-        assignment = reidentify(candidates, lost, self.limits, cameras=cameras, max_births=most)
+        assignment = reidentify(candidates, lost, self.limits, max_births=most)
         # What is no drone yet, because it does not move for instance, is followed on.
         taken = [each for each, row in zip(candidates, assignment, strict=True) if row >= 0 or row == NEW]
         self._births.take(taken)
