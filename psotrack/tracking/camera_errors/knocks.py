@@ -21,7 +21,8 @@ from psotrack.tracking.camera_errors.variance_components import FittedPlaces
 _WINDOWS = (10, 20, 40, 80)
 #: A step has this many times the length that a difference between neighbouring windows usually has.
 _CLEAR = 6.0
-#: Least part of a step that the shortest window shows; part that all frames before and after show.
+#: Least part of a step that the shortest window shows; part that windows of twice the length, and all frames before and
+#: after show: errors of a lens grow as a body comes to the border.
 _SUDDEN, _STAYS = 0.5, (0.75, 1 / 0.75)
 #: Largest length of both windows, in frames of the recording for each frame that the camera shows.
 _DENSE = 2.0
@@ -120,12 +121,14 @@ def _steps(
             float(_change(*shortest)[0] @ change_px[best]),
         )
         part = _part_that_stays(change_px[best], equations, sets, int(at))
+        begin, end = max(at - 2 * window, 0), min(at + 2 * window, len(frames))
+        longer = float(_change(total[at] - total[begin], total[end] - total[at])[0] @ change_px[best])
         clearly = float(np.sqrt(clear[best])) / max(float(usual), np.finfo(float).tiny)
         if (
             clearly > _CLEAR
             and length2 > _LEAST_PX**2
             and sudden > _SUDDEN * length2
-            and _STAYS[0] < part < _STAYS[1]
+            and all(_STAYS[0] < each < _STAYS[1] for each in (part, longer / length2))
         ):
             levels_px = [
                 _solved(each)[0] for each in (total[at] - total[at - window], total[at + window] - total[at])
