@@ -353,7 +353,6 @@ LOST_LIGHT = {
     "blue": dict.fromkeys(BURST, BLUE),
     "white": dict.fromkeys(BURST, np.uint8([255, 255, 255])),
     "another picture": {i: _exposed(_room(_noise), _noise) for i in BURST},
-    "flash": dict.fromkeys(BURST, 4.0),
     "a tenth for long": dict.fromkeys(range(30, 80), 0.1),
     "sinks and comes back": {i: 1 - 0.9 * np.exp(-(((i - 60) / 8) ** 2)) for i in range(40, 80)},
     "a lamp flickers": {i: 0.3 for i in range(40, 90) if i // 3 % 2},
