@@ -20,7 +20,7 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.evaluation.consistency import consistency
+from psotrack.evaluation.scores import consistency
 from psotrack.geometry import Rig, project
 from psotrack.settings import TrackSettings
 from psotrack.simulation import build, scenario

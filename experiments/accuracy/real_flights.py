@@ -35,7 +35,7 @@ from reference import BATS, psotrack
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from psotrack.evaluation.consistency import consistency
+from psotrack.evaluation.scores import consistency
 from psotrack.geometry import make_camera, make_rig
 from psotrack.geometry.rig_files import write_rig
 from psotrack.pipeline import Parts, prepare

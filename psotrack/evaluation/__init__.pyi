@@ -1,8 +1,8 @@
-from .consistency import INSIDE_90
 from .metrics import errors_over_time, evaluate
 from .offsets import Offset, find_offset
 from .path_comparison import PathComparison, PathSettings, Statistics, compare_paths, drone_of
-from .records import DroneEvaluation, ErrorSummary, Evaluation
+from .scores import INSIDE_90
+from .tables import DroneEvaluation, ErrorSummary, Evaluation
 
 __all__ = [
     "INSIDE_90",

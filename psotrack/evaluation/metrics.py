@@ -19,11 +19,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from psotrack.evaluation.consistency import consistency
-from psotrack.evaluation.gospa import gospa
-from psotrack.evaluation.hota import hota
-from psotrack.evaluation.paths import path_errors, rows_apart
-from psotrack.evaluation.records import DroneEvaluation, ErrorSummary, Evaluation
+from psotrack.evaluation.scores import consistency, gospa, hota, path_errors, rows_apart
+from psotrack.evaluation.tables import DroneEvaluation, ErrorSummary, Evaluation
 from psotrack.support.standard_errors import standard_error
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (
@@ -66,14 +63,14 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     - `idf1` = 2 IDTP / (known + estimated), where IDTP is the number of frames within 0.5 m under the assignment of
       whole tracks that has the most such frames (Ristani et al. 2016).
     - A track whose drone has no known position in a frame is no false positive, unless it is near another drone.
-    - `hota`, `deta`, `assa`, `loca`: see `hota.hota`; `gospa_*`: see `gospa.gospa`.
+    - `hota`, `deta`, `assa`, `loca`: see `scores.hota`; `gospa_*`: see `scores.gospa`.
     - `offset_removed_mean_error_m`: the mean error after each drone's mean residual is subtracted: in the body's frame
       where the reference's orientation is known, else in the world's frame. The middles of silhouettes and of marker
       crosses differ from the body's origin, which is no fault of a tracker. In `per_drone`, `offset_m` is this lever
       arm and `offset_standard_error_m` its standard error (see `standard_errors.standard_error`).
-    - `ate_*`, `rpe_*`: see `paths.path_errors`. For all drones together, `ate_aligned_rmse_m` aligns all tracks by one
+    - `ate_*`, `rpe_*`: see `scores.path_errors`. For all drones together, `ate_aligned_rmse_m` aligns all tracks by one
       rigid motion; in `per_drone`, each track by its own.
-    - `inside_90_rate`, `mean_nees`, where the estimate has covariances: see `consistency.consistency`.
+    - `inside_90_rate`, `mean_nees`, where the estimate has covariances: see `scores.consistency`.
 
     Args:
         traj_est: the estimate, in the reference's frames.

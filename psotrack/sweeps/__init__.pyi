@@ -1,9 +1,8 @@
-from .cells import Cell, Perturbation, cameras_label, cell_key
-from .cluster import Cluster
+from .cells import Cell, Perturbation, cameras_label, cell_key, delays_frames, perturb
 from .grid_files import Grid, grid, read_grid
 from .grid_runs import SweepOutcome, SweepPlan, plan, sweep
 from .inputs import Inputs
-from .perturbations import delays_frames, perturb
+from .runner import Cluster
 from .store import Store
 from .tables import pivot, render_table
 

@@ -1,12 +1,9 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import DroneRows, check_cells, from_rows, read_trajectories, write_ambiguity, write_trajectories
-from .orientations import roll_pitch_yaw_deg, rotation_matrices
-from .resampling import merged, resample
+from .resampling import merged, resample, roll_pitch_yaw_deg, rotation_matrices
 from .row_streams import RowStream
-from .status import Status
-from .summaries import drones_html, summary_columns
-from .tracks import ARRAYS, Arrival, Tracks, padded
-from .trajectories import QUANTITIES, Trajectories
+from .tracks import ARRAYS, Arrival, Status, Tracks, padded
+from .trajectories import QUANTITIES, Trajectories, drones_html, summary_columns
 
 __all__ = [
     "ARRAYS",

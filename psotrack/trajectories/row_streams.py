@@ -12,9 +12,8 @@ from pathlib import Path
 
 from psotrack.errors import InputError, OutputError
 from psotrack.support import refuse_to_overwrite
-from psotrack.trajectories.columns import columns_of
 from psotrack.trajectories.files import words_of
-from psotrack.trajectories.trajectories import Trajectories
+from psotrack.trajectories.trajectories import Trajectories, columns_of
 
 
 class RowStream:

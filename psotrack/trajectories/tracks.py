@@ -7,13 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.support import short_repr
-from psotrack.trajectories.status import Status
+
+
+class Status(IntEnum):
+    """Status of a drone in a frame."""
+
+    #: The position comes from a measurement.
+    TRACKED = 0
+    #: The position is predicted over a gap without measurements.
+    COASTING = 1
+    #: The position is the last prediction, for display only; the drone counts as missed.
+    LOST = 2
+
+    @property
+    def label(self) -> str:
+        """Word in tables and files."""
+        return self.name.lower()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pytest
 from helpers import assert_refused, listening_at
 from small_sweeps import all_rows, environment, grid_file, small_sequence, wait_until
 
-from psotrack.sweeps import Cluster, Inputs, Store, cluster, read_grid
+from psotrack.sweeps import Cluster, Inputs, Store, read_grid, runner
 
 pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
@@ -117,7 +117,7 @@ def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
 
     monkeypatch.setattr("distributed.Client", refuse)
     cells = list(read_grid(grid_file(tmp_path, [2])).cells())
-    ran = cluster.run_on_cluster(Cluster(address), cells, Inputs(tmp_path, tmp_path), Store(tmp_path))
+    ran = runner.run_on_cluster(Cluster(address), cells, Inputs(tmp_path, tmp_path), Store(tmp_path))
     assert_refused(functools.partial(next, ran), "nobody listens", unchanged=tmp_path)
     lines = [record.getMessage() for record in caplog.records if "TLS" in record.getMessage()]
     assert len(lines) == warned

@@ -23,7 +23,7 @@ from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.recordings import Recording, VideoInfo
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
 from psotrack.sweeps import Perturbation, cell_key, grid, perturb, read_grid
-from psotrack.sweeps.perturbations import choose_cameras
+from psotrack.sweeps.cells import choose_cameras
 
 FILE = """
 sequences = ["S01_D2_A", "S04_D10"]

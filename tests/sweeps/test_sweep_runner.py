@@ -24,10 +24,9 @@ from small_sweeps import SETTINGS, all_rows, grid_file, small_sequence, stamps
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
 from psotrack.support import register_plugin
-from psotrack.sweeps import Inputs, Store, SweepOutcome, cell_key, machine, plan, runner, sweep
+from psotrack.sweeps import Inputs, Store, SweepOutcome, cell_key, inputs, plan, runner, sweep
 from psotrack.sweeps import grid as grid_of
-from psotrack.sweeps import inputs as inputs_of_cells
-from psotrack.sweeps.locks import Locks
+from psotrack.sweeps.store import Locks
 
 METHODS = """
 [methods.usual]
@@ -243,7 +242,7 @@ class TestRunner:
 
         def key(recording, **settings: object) -> str:
             (cell,) = grid_of(varied(3, **settings)).cells()
-            monkeypatch.setattr(inputs_of_cells, "open_recording", lambda folder: recording)
+            monkeypatch.setattr(inputs, "open_recording", lambda folder: recording)
             return cell_key(cell, Inputs(root, root / "cache").keys_of(cell))
 
         def with_cameras_of(**changes: object):
@@ -269,7 +268,7 @@ class TestRunner:
         keys.append(key(usual, **{"score.kind": "own"}))
         file.write_text("def make(settings): return 1")
         keys.append(key(usual, **{"score.kind": "own"}))
-        monkeypatch.setattr(inputs_of_cells, "code_digest", lambda: "changed")
+        monkeypatch.setattr(inputs, "code_digest", lambda: "changed")
         keys.append(key(usual))
         assert len(set(keys)) == len(keys)
 
@@ -301,20 +300,19 @@ def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path,
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:
             file.write("# another line")
-        machine.code_digest.cache_clear()
-        return machine.code_digest()
+        inputs.code_digest.cache_clear()
+        return inputs.code_digest()
 
     with monkeypatch.context() as small:
-        small.setattr(machine, "_PACKAGE", tmp_path)
+        small.setattr(inputs, "_PACKAGE", tmp_path)
         before = digest_after("tracking/swarm/tracker.py")
         assert digest_after("cli/sweep.py") == before
         assert digest_after("tracking/swarm/tracker.py") != before
-    machine.code_digest.cache_clear()
-    program = "import sys; from psotrack.sweeps import runner, perturbations; print(*sys.modules)"
+    inputs.code_digest.cache_clear()
+    program = "import sys; from psotrack.sweeps import runner; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    # These are imported, and compute no row.
-    needless = {"sweeps/locks", "sweeps/tables"}
-    left_out = tuple(f"psotrack/{name}" for name in machine.COMPUTES_NO_ROW if name not in needless)
+    # Tables are imported, and compute no row.
+    left_out = tuple(f"psotrack/{name}" for name in inputs.COMPUTES_NO_ROW if name != "sweeps/tables")
     for module in done.stdout.split():
         path = module.replace(".", "/")
         assert not f"{path}/".startswith(left_out)
@@ -328,5 +326,5 @@ def test_a_package_in_the_checkout_of_another_project_has_not_its_commit(tmp_pat
     subprocess.run([*git, "init", "-q"], check=True)
     subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "a"], check=True)
     (tmp_path / "__init__.py").touch()
-    machine.commit.cache_clear()
-    assert machine.commit(tmp_path) == ""
+    inputs.commit.cache_clear()
+    assert inputs.commit(tmp_path) == ""

@@ -1,9 +1,21 @@
-from .appearance import Ellipsoids, colour_rgb, ellipsoids_90, status_rgb, statuses
-from .events import Event, EventKind, find_events, intervals
+from .events import (
+    QUANTITIES,
+    Event,
+    EventKind,
+    Quantity,
+    camera_quality,
+    deviations_mm,
+    find_events,
+    intervals,
+    quantities,
+)
 from .flight import (
     USUAL_SIZE_M,
+    Ellipsoids,
     FlightTracks,
     TrackedFlight,
+    colour_rgb,
+    ellipsoids_90,
     find_recording,
     first_instants,
     flight_of,
@@ -11,18 +23,20 @@ from .flight import (
     read_tracks_file,
     rows_at,
     split_sequence,
+    status_rgb,
+    statuses,
 )
-from .quality import QUANTITIES, Quantity, camera_quality, deviations_mm, quantities
 from .run_record import (
     LearnedDrone,
     MeetingRecord,
     RunRecord,
+    RunSummary,
     read_run_record,
     record_files,
     recording_beside,
+    run_summary,
     write_tracked,
 )
-from .run_summary import RunSummary, run_summary
 
 __all__ = [
     "QUANTITIES",

@@ -1,6 +1,5 @@
 from .flight_report import WrittenPage, write_flight_report
-from .page import MOST_BYTES, write_page
-from .scene import MOST_ROWS, View3D, view_3d
+from .scene import MOST_BYTES, MOST_ROWS, View3D, view_3d, write_page
 
 __all__ = [
     "MOST_BYTES",

@@ -1,8 +1,7 @@
-from .camera_images import CameraKey, ImagePlan
+from .camera_images import CameraKey, ImagePlan, find_silhouettes
 from .flight_file import ViewContent, WrittenFlight, write_flight
 from .live_view import LiveView
 from .programs import check_display, check_installed, show_in_browser, show_window, viewer_program
-from .stored_silhouettes import find_silhouettes
 
 __all__ = [
     "CameraKey",

@@ -13,15 +13,16 @@ from psotrack.geometry import rotation_matrices
 from psotrack.recordings import OnboardVideo, Recording, ellipse_outlines_px, read_detections, view_in_images
 from psotrack.show.flights import FlightTracks, TrackedFlight
 from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSource, encode_images
-from psotrack.show.viewer.entity_log import (
+from psotrack.show.viewer.entities import (
+    MARKER_RGB,
     EntityLog,
     Instants,
     camera_path,
     instants,
+    pinhole,
     shown_rgb,
     tracks_path,
 )
-from psotrack.show.viewer.space import MARKER_RGB, pinhole
 from psotrack.support import Advance
 
 _DETECTION_RGB = (255, 214, 10)

@@ -20,12 +20,17 @@ from psotrack.show.flights import (
     flight_of,
     statuses,
 )
-from psotrack.show.viewer.entity_log import EntityLog, Instants, instants, shown_rgb
-from psotrack.show.viewer.flight_file import APPLICATION
-from psotrack.show.viewer.layout import live_blueprint
-from psotrack.show.viewer.plots import log_status
+from psotrack.show.viewer.entities import (
+    EntityLog,
+    Instants,
+    instants,
+    log_drones,
+    log_status,
+    log_world,
+    shown_rgb,
+)
+from psotrack.show.viewer.flight_file import APPLICATION, live_blueprint
 from psotrack.show.viewer.programs import viewer_program
-from psotrack.show.viewer.space import log_drones, log_world
 from psotrack.support import drone_colour, whole_number
 from psotrack.trajectories import Trajectories
 
