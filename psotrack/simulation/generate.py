@@ -35,25 +35,10 @@ from psotrack.recordings import (
     RecordingFile,
     ReferenceTable,
     VideoWriter,
+    datasets,
     join_videos,
     write_detections,
     write_recording_file,
-)
-from psotrack.recordings.datasets import (
-    CALIBRATION,
-    DETECTIONS,
-    MARKER_CORNERS,
-    MASKS,
-    ONBOARD_CALIBRATION,
-    MaskWriter,
-    join_archives,
-    mocap_markers_file,
-    onboard_pose_file,
-    pose_file,
-    write_marker_corners,
-    write_mocap_markers,
-    write_onboard_calibration,
-    write_poses,
 )
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.renderer import (
@@ -64,7 +49,7 @@ from psotrack.simulation.imaging.renderer import (
     lens,
     onboard_poses,
 )
-from psotrack.simulation.labels import Silhouette, detect, lens_silhouettes, silhouettes
+from psotrack.simulation.labels import Silhouette, detect
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario, SimulationSettings
 from psotrack.simulation.scene import Scene, build
 from psotrack.support import (
@@ -164,17 +149,17 @@ class Work:
     """Segments of one stream that one process draws, one after the other.
 
     Attributes:
-        scene: the scene to draw_segments.
+        scene: the scene to draw.
         stream: the camera's stream.
         masks: whether to write the drones' masks.
-        folder: folder of the stream's segments.
+        parts: folder of the segments of all streams.
         segments: frame numbers of each segment.
     """
 
     scene: Scene
     stream: Stream
     masks: bool
-    folder: Path
+    parts: Path
     segments: tuple[range, ...]
 
 
@@ -184,97 +169,47 @@ def segments(num_frames: int) -> list[range]:
     return [range(start, min(start + SEGMENT_FRAMES, num_frames)) for start in starts]
 
 
-def segment_folder(folder: Path, frames: range) -> Path:
-    """Folder of a complete segment, inside the folder of its stream's segments."""
-    return folder / f"{frames.start:06d}"
+def _segment_folder(parts: Path, stream: Stream, frames: range) -> Path:
+    """Folder of a complete segment, inside the folder of all segments."""
+    return parts / stream.name / f"{frames.start:06d}"
 
 
-def draw_segments(work: Work, advance: Advance) -> None:
+def _draw(work: Work, advance: Advance) -> None:
     """Draw the segments of one piece of work; `advance` counts frames."""
     scene, stream = work.scene, work.stream
     artist = OnboardRenderer(scene, stream.index) if stream.onboard else CameraRenderer(scene, stream.index)
     for frames in work.segments:
-        with atomic_write(segment_folder(work.folder, frames)) as temporary:
-            temporary.mkdir()
-            _draw_segment(work, artist, temporary, frames, advance)
-
-
-def _draw_segment(
-    work: Work, artist: CameraRenderer | OnboardRenderer, folder: Path, frames: range, advance: Advance
-) -> None:
-    """Write the video of a segment; of a static camera, masks and detections too."""
-    found = []
-    with contextlib.ExitStack() as stack:
-        video = stack.enter_context(VideoWriter(folder / _VIDEO, work.scene.scenario.fps, artist.size_wh))
-        masks = None
-        if work.masks and not work.stream.onboard:
-            masks = stack.enter_context(MaskWriter(folder / _MASKS))
-        for frame in frames:
-            video.write(artist.frame(frame))
+        with atomic_write(_segment_folder(work.parts, stream, frames)) as folder:
+            folder.mkdir()
+            with VideoWriter(folder / _VIDEO, scene.scenario.fps, artist.size_wh) as video:
+                for frame in frames:
+                    video.write(artist.frame(frame))
+                    advance(1)
             if isinstance(artist, CameraRenderer):
-                drones = _silhouettes(artist, frame)
-                found.append(detect(work.scene, work.stream.index, frame, drones))
-                if masks is not None:
-                    _write_masks(masks, work.stream.name, frame, drones, artist)
-            advance(1)
-    if found:
-        write_detections(folder / _BOXES, _concatenated(found))
+                _write_labels(work, folder, {frame: artist.silhouettes(frame) for frame in frames})
 
 
-def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
-    """Join the segments' videos, and the detections of a static camera.
+def _write_labels(work: Work, folder: Path, drones: dict[int, list[Silhouette]]) -> None:
+    """Write the detections of a segment of a static camera, and the mask of each drone; black where it is not seen."""
+    found = [detect(work.scene, work.stream.index, frame, seen) for frame, seen in drones.items()]
+    parts = ([getattr(each, name) for each in found] for name in ("frame", "xyxy", "confidence"))
+    write_detections(folder / _BOXES, Detections(*map(np.concatenate, parts)))
+    if work.masks:
+        width, height = work.scene.rig.cameras.image_size_wh[work.stream.index].tolist()
+        with datasets.MaskWriter(folder / _MASKS) as writer:
+            for frame, seen in drones.items():
+                masks = {drone.number: drone.mask() for drone in seen}
+                for number in range(1, len(work.scene.flights) + 1):
+                    mask = masks.get(number, np.zeros((height, width), bool))
+                    writer.write(work.stream.name, number, frame, mask)
 
-    Args:
-        stream: the stream to write.
-        parts: folders of the stream's segments, in order.
-        folder: folder of the sequence.
 
-    Raises:
-        OutputError: a file cannot be written.
-    """
+def _join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
+    """Join the videos of the segments of a stream, and the detections of a static camera."""
     if not stream.onboard:
-        with atomic_write(folder / DETECTIONS / f"{stream.name}_s.csv") as temporary:
+        with atomic_write(folder / datasets.DETECTIONS / f"{stream.name}_s.csv") as temporary:
             temporary.write_bytes(b"".join((part / _BOXES).read_bytes() for part in parts))
     join_videos(folder / stream.video_file, [part / _VIDEO for part in parts])
-
-
-def join_masks(parts: Sequence[Path], folder: Path) -> None:
-    """Write the archive of all masks.
-
-    Args:
-        parts: folders of the segments of all static cameras, in order.
-        folder: folder of the sequence.
-
-    Raises:
-        OutputError: the archive cannot be written.
-    """
-    join_archives(folder / MASKS, [part / _MASKS for part in parts])
-
-
-def _silhouettes(renderer: CameraRenderer, frame: int) -> list[Silhouette]:
-    scene, cam = renderer.scene, renderer.cam
-    if renderer.lens is None:
-        return silhouettes(scene, cam, renderer.backdrop.depth_m, frame)
-    depths_m = [view.backdrop.depth_m for view in renderer.views]
-    return lens_silhouettes(scene, cam, renderer.lens, depths_m, frame)
-
-
-def _write_masks(
-    writer: MaskWriter, camera: str, frame: int, drones: Sequence[Silhouette], artist: CameraRenderer
-) -> None:
-    """Write one mask per drone of the scene; the mask of a drone that the camera does not see is black."""
-    in_view = {drone.number: drone.mask() for drone in drones}
-    black = np.zeros(artist.size_wh[::-1], bool)
-    for number in range(1, len(artist.scene.flights) + 1):
-        writer.write(camera, number, frame, in_view.get(number, black))
-
-
-def _concatenated(found: Sequence[Detections]) -> Detections:
-    return Detections(
-        np.concatenate([detections.frame for detections in found]),
-        np.concatenate([detections.xyxy for detections in found]),
-        np.concatenate([detections.confidence for detections in found]),
-    )
 
 
 #: File that says how the sequence was made.
@@ -344,16 +279,22 @@ def simulate(
     streams, every = _streams(scene, settings.onboard), segments(frames)
     with unfinished(folder, record) as parts:
         works = _missing(scene, streams, every, settings.masks, parts)
-        _draw_all(works, len(streams) * frames, jobs or os.cpu_count() or 1, report)
+        waiting = sum(len(some) for work in works for some in work.segments)
+        total = len(streams) * frames
+        if waiting < total:
+            _logger.info("%d of %d frames were drawn by an earlier call", total - waiting, total)
+        with report("simulate", total) as advance:
+            advance(total - waiting)
+            map_in_processes(_draw, works, jobs=jobs or os.cpu_count() or 1, advance=advance)
         with atomic_write(folder) as growing:
             growing.mkdir()
+            masks = []
             for stream in streams:
-                join(stream, [segment_folder(parts / stream.name, some) for some in every], growing)
+                folders = [_segment_folder(parts, stream, some) for some in every]
+                _join(stream, folders, growing)
+                masks += [] if stream.onboard else [part / _MASKS for part in folders]
             if settings.masks:
-                static = [stream for stream in streams if not stream.onboard]
-                join_masks(
-                    [segment_folder(parts / one.name, some) for one in static for some in every], growing
-                )
+                datasets.join_archives(growing / datasets.MASKS, masks)
             _write_tables(scene, growing, frames)
             if settings.onboard:
                 _write_onboard_tables(scene, growing, frames)
@@ -398,27 +339,16 @@ def _missing(
     """Pieces of work for the segments that are not drawn yet."""
     works = []
     for stream in streams:
-        folder = parts / stream.name
-        missing = [frames for frames in every if not segment_folder(folder, frames).exists()]
+        missing = [frames for frames in every if not _segment_folder(parts, stream, frames).exists()]
         for start in range(0, len(missing), _PIECE):
-            works.append(Work(scene, stream, masks, folder, tuple(missing[start : start + _PIECE])))
+            works.append(Work(scene, stream, masks, parts, tuple(missing[start : start + _PIECE])))
     return works
-
-
-def _draw_all(works: Sequence[Work], total: int, jobs: int, report: Report) -> None:
-    """Draw what is missing of `total` frames of all streams."""
-    waiting = sum(len(frames) for work in works for frames in work.segments)
-    if waiting < total:
-        _logger.info("%d of %d frames were drawn by an earlier call", total - waiting, total)
-    with report("simulate", total) as advance:
-        advance(total - waiting)
-        map_in_processes(draw_segments, works, jobs=jobs, advance=advance)
 
 
 def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
     fps = scene.scenario.fps
     try:
-        write_calibration(folder / CALIBRATION, scene.rig, unit="m")
+        write_calibration(folder / datasets.CALIBRATION, scene.rig, unit="m")
     except SettingsError:
         # The dataset's file has no columns for such lenses, but a rig file and a recording file have.
         write_rig(folder / _RIG, scene.rig)
@@ -427,25 +357,27 @@ def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
     markers_m = scene.mocap_markers_m(num_frames)
     for drone in range(len(scene.flights)):
         number = drone + 1
-        write_poses(folder / pose_file(number, fps), position_m[:, drone], orientation_wxyz[:, drone])
-        write_mocap_markers(folder / mocap_markers_file(number, fps), markers_m[:, drone])
+        datasets.write_poses(
+            folder / datasets.pose_file(number, fps), position_m[:, drone], orientation_wxyz[:, drone]
+        )
+        datasets.write_mocap_markers(folder / datasets.mocap_markers_file(number, fps), markers_m[:, drone])
     if scene.scenario.markers:
-        write_marker_corners(folder / MARKER_CORNERS, scene.room.marker_corners_m)
+        datasets.write_marker_corners(folder / datasets.MARKER_CORNERS, scene.room.marker_corners_m)
 
 
 def _recording_file(scene: Scene) -> RecordingFile:
     """The recording file of a sequence whose lenses the dataset's calibration cannot hold."""
     cameras = {
-        name: CameraTable(video=stream.video_file, detections=f"{DETECTIONS}/{stream.name}_s.csv")
+        name: CameraTable(video=stream.video_file, detections=f"{datasets.DETECTIONS}/{stream.name}_s.csv")
         for name, stream in zip(scene.rig.names, _streams(scene, onboard=False), strict=True)
     }
-    files = tuple(pose_file(drone + 1, scene.scenario.fps) for drone in range(len(scene.flights)))
+    files = tuple(datasets.pose_file(drone + 1, scene.scenario.fps) for drone in range(len(scene.flights)))
     return RecordingFile(
         version=1,
         calibration=_RIG,
         cameras=cameras,
         reference=ReferenceTable(files=files),
-        markers=MarkersTable(corners=MARKER_CORNERS) if scene.scenario.markers else None,
+        markers=MarkersTable(corners=datasets.MARKER_CORNERS) if scene.scenario.markers else None,
     )
 
 
@@ -455,7 +387,9 @@ def _write_onboard_tables(scene: Scene, folder: Path, num_frames: int) -> None:
         # The dataset's table has no distortion, and without it the lens would be wrong.
         write_rig(folder / _ONBOARD_LENSES, make_rig(dict.fromkeys(names, lens(scene))))
     else:
-        write_onboard_calibration(folder / ONBOARD_CALIBRATION, dict.fromkeys(names, intrinsics(scene)))
+        datasets.write_onboard_calibration(
+            folder / datasets.ONBOARD_CALIBRATION, dict.fromkeys(names, intrinsics(scene))
+        )
     for drone in range(len(scene.flights)):
         poses = onboard_poses(scene, drone, num_frames)
-        write_poses(folder / onboard_pose_file(drone + 1, scene.scenario.fps), *poses)
+        datasets.write_poses(folder / datasets.onboard_pose_file(drone + 1, scene.scenario.fps), *poses)

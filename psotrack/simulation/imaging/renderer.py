@@ -50,6 +50,7 @@ from psotrack.simulation.imaging.raster import (
     windows,
 )
 from psotrack.simulation.imaging.scenery import Scenery
+from psotrack.simulation.labels import Silhouette, lens_silhouettes, silhouettes
 from psotrack.simulation.scenarios import OnboardCamera
 from psotrack.simulation.scene import Scene, image_size_wh
 from psotrack.simulation.world.rooms import room
@@ -122,6 +123,13 @@ class CameraRenderer:
     def frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
         return self.sensor.expose(self.clean_frame(frame), frame, self.scene.time_s(frame))
+
+    def silhouettes(self, frame: int) -> list[Silhouette]:
+        """Silhouettes of the drones within the image of a frame, ordered by number."""
+        depths_m = [view.backdrop.depth_m for view in self.views]
+        if self.lens is None:
+            return silhouettes(self.scene, self.cam, depths_m[0], frame)
+        return lens_silhouettes(self.scene, self.cam, self.lens, depths_m, frame)
 
 
 class View:
