@@ -27,6 +27,7 @@ from psotrack.trajectories.association import (
     GATE_M,
     UNASSIGNED,
     AlignedPair,
+    Distances,
     align,
     fixed_identity,
     fixed_partner_values,
@@ -190,7 +191,7 @@ def _counted_estimates(
     return np.isfinite(pair.est_m).all(axis=-1) & (near_a_drone | ~unknown)
 
 
-def _identity_true_positives(distance_m: Float[np.ndarray, "frames drones estimates"]) -> int:
+def _identity_true_positives(distance_m: Distances) -> int:
     """Number of frames within the gate under the assignment of whole tracks that has the most such frames."""
     together = (distance_m <= GATE_M).sum(axis=0)
     return int(together[linear_sum_assignment(together, maximize=True)].sum())

@@ -24,6 +24,10 @@ from psotrack.support import block_jackknife, standard_error, time_blocks, widen
 from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values, rotation_matrices
 from psotrack.trajectories.resampling import interpolated
 
+_Vectors = Float[np.ndarray, "frames drones 3"]
+_Partner = Int[np.ndarray, "drones"]
+_Curve = Float[np.ndarray, "offsets"]
+_Arms = Float[np.ndarray, "drones 3"]
 #: An offset counts only if at least this fraction of the largest number of comparable positions is compared at it.
 MIN_OVERLAP = 0.5
 #: Another minimum is worse for certain if its distance is larger by this multiple of the difference's standard error.
@@ -64,11 +68,11 @@ class Offset:
     std_s: float
     mean_distance_m: float
     mean_distance_before_m: float | None
-    lever_arm_m: Float[np.ndarray, "drones 3"]
-    partner: Int[np.ndarray, "drones"]
+    lever_arm_m: _Arms
+    partner: _Partner
     overlap: float
-    curve_s: Float[np.ndarray, "offsets"]
-    curve_m: Float[np.ndarray, "offsets"]
+    curve_s: _Curve
+    curve_m: _Curve
 
 
 def find_offset(
@@ -206,7 +210,7 @@ class ShiftedPair:
             curve_m=curve_m,
         )
 
-    def partner(self, offset_s: float) -> Int[np.ndarray, "drones"]:
+    def partner(self, offset_s: float) -> _Partner:
         """(drones,), index of the estimated drone that is assigned to each drone of the reference.
 
         The assignment has the smallest sum of mean distances, which include the lever arms.
@@ -221,22 +225,20 @@ class ShiftedPair:
         partner[drones] = np.where(count[drones, estimates] > 0, estimates, UNASSIGNED)
         return partner
 
-    def without_far(self, offset_s: float) -> Int[np.ndarray, "drones"]:
+    def without_far(self, offset_s: float) -> _Partner:
         """The assignment without drones whose lever arm is longer than the gate, unless all are longer."""
         partner = self.partner(offset_s)
         near = np.linalg.norm(_medians(self._differences_m(offset_s, partner)), axis=-1) <= GATE_M
         return np.where(near, partner, UNASSIGNED) if near.any() else partner
 
-    def residuals(
-        self, offset_s: float, partner: Int[np.ndarray, "drones"]
-    ) -> tuple[Float[np.ndarray, "drones 3"], Float[np.ndarray, "frames drones 3"]]:
+    def residuals(self, offset_s: float, partner: _Partner) -> tuple[_Arms, _Vectors]:
         """Lever arms, and the differences between estimate and reference without them, in the arms' frame, metres.
 
         NaN where the estimate or the reference is missing, and for drones that are not compared.
         """
         return self._without_arms(self._differences_m(offset_s, partner))
 
-    def _curve(self, curve_s: Float[np.ndarray, "offsets"], reach_s: float) -> Float[np.ndarray, "offsets"]:
+    def _curve(self, curve_s: _Curve, reach_s: float) -> _Curve:
         """Mean distance at each offset, metres; NaN where too few positions can be compared (`MIN_OVERLAP`)."""
         mean_m, count = np.full(len(curve_s), np.nan), np.zeros(len(curve_s), int)
         for row, offset_s in enumerate(curve_s):
@@ -248,7 +250,7 @@ class ShiftedPair:
             raise refused(f"positions of both at offsets within {reach_s:g} s", "none")
         return np.where(count >= MIN_OVERLAP * count.max(), mean_m, np.nan)
 
-    def _least(self, partner: Int[np.ndarray, "drones"], near_s: float, reach_s: float) -> float:
+    def _least(self, partner: _Partner, near_s: float, reach_s: float) -> float:
         """The offset with the smallest mean distance between near_s - reach_s and near_s + reach_s, by Brent's method.
 
         Only positions count that can be compared at both ends: a position that can be compared at some offsets only
@@ -266,12 +268,7 @@ class ShiftedPair:
         )
         return float(found.x)
 
-    def _standard_deviation_s(
-        self,
-        offset_s: float,
-        arm_m: Float[np.ndarray, "drones 3"],
-        residual_m: Float[np.ndarray, "frames drones 3"],
-    ) -> float:
+    def _standard_deviation_s(self, offset_s: float, arm_m: _Arms, residual_m: _Vectors) -> float:
         """Standard deviation of the offset, by a block jackknife, seconds; infinite without motion.
 
         An error that always points along the motion is not included, because such an error looks like an offset.
@@ -295,12 +292,7 @@ class ShiftedPair:
         freedom = weight.sum() ** 2 / (weight**2).sum() - 1
         return float(np.sqrt(variance_s2[0, 0]) * widening(np.array(freedom)))
 
-    def _step_s(
-        self,
-        r: Float[np.ndarray, "frames drones 3"],
-        v: Float[np.ndarray, "frames drones 3"],
-        kept: np.ndarray,
-    ) -> float:
+    def _step_s(self, r: _Vectors, v: _Vectors, kept: np.ndarray) -> float:
         """The change of the offset that makes the sum of |r + v change - arm| smallest, by reweighted least squares."""
         change_s, arm_m = 0.0, np.zeros((1, r.shape[1], 3))
         for _ in range(_BLOCK_STEPS):
@@ -317,24 +309,18 @@ class ShiftedPair:
             arm_m = mean_r + mean_v * change_s
         return change_s
 
-    def placed_m(
-        self, offset_s: float, arm_m: Float[np.ndarray, "drones 3"]
-    ) -> Float[np.ndarray, "frames drones 3"]:
+    def placed_m(self, offset_s: float, arm_m: _Arms) -> _Vectors:
         """The tracked points by the reference, with the lever arms, in the world."""
         point_m = self.position_m(self.time_s + offset_s)
         return point_m + (
             arm_m if self.rotation is None else np.einsum("fdij,dj->fdi", self.rotation(offset_s), arm_m)
         )
 
-    def _differences_m(
-        self, offset_s: float, partner: Int[np.ndarray, "drones"]
-    ) -> Float[np.ndarray, "frames drones 3"]:
+    def _differences_m(self, offset_s: float, partner: _Partner) -> _Vectors:
         difference_m = fixed_partner_values(self.est_m, partner) - self.position_m(self.time_s + offset_s)
         return difference_m if self.rotation is None else _turned_back(self.rotation(offset_s), difference_m)
 
-    def _without_arms(
-        self, differences_m: Float[np.ndarray, "frames drones 3"]
-    ) -> tuple[Float[np.ndarray, "drones 3"], Float[np.ndarray, "frames drones 3"]]:
+    def _without_arms(self, differences_m: _Vectors) -> tuple[_Arms, _Vectors]:
         arm_m = _medians(differences_m)
         if not self.with_lever_arm:
             arm_m = np.abs(0.0 * arm_m)
@@ -346,9 +332,7 @@ def refused(expected: str, found: str, remedy: str = "") -> InputError:
     return InputError("estimate and reference", expected=expected, found=found, remedy=remedy)
 
 
-def _turned_back(
-    rotation: Float[np.ndarray, "frames drones 3 3"], values: Float[np.ndarray, "frames drones 3"]
-) -> Float[np.ndarray, "frames drones 3"]:
+def _turned_back(rotation: Float[np.ndarray, "frames drones 3 3"], values: _Vectors) -> _Vectors:
     return np.einsum("fdji,fdj->fdi", rotation, values)
 
 
@@ -358,12 +342,7 @@ def _per_frame(distance_m: Float[np.ndarray, "frames drones"]) -> Float[np.ndarr
     return np.where(count > 0, np.nansum(distance_m, axis=1) / np.maximum(count, 1), np.nan)[:, None]
 
 
-def _check_unique(
-    curve_s: Float[np.ndarray, "offsets"],
-    curve_m: Float[np.ndarray, "offsets"],
-    error_m: float,
-    frame_s: float,
-) -> None:
+def _check_unique(curve_s: _Curve, curve_m: _Curve, error_m: float, frame_s: float) -> None:
     """Raise an error if the distance is not clearly larger at another offset, apart from the best offset."""
     low_s = curve_s[curve_m <= np.nanmin(curve_m) + _CLEARLY * np.sqrt(2) * error_m]
     apart = np.diff(low_s) > max(frame_s, 1.5 * (curve_s[1] - curve_s[0]))
@@ -376,7 +355,7 @@ def _check_unique(
         )
 
 
-def _medians(values: Float[np.ndarray, "frames drones 3"]) -> Float[np.ndarray, "drones 3"]:
+def _medians(values: _Vectors) -> _Arms:
     """Geometric median of each drone's values; NaN without values."""
     found = np.full(values.shape[1:], np.nan)
     known = np.isfinite(values).all(axis=-1)

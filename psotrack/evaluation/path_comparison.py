@@ -31,6 +31,9 @@ from psotrack.trajectories import (
     rotation_matrices,
 )
 
+_Quaternions = Float[np.ndarray, "frames 4"]
+_Points = Float[np.ndarray, "frames 3"]
+_Values = Float[np.ndarray, "frames"]
 #: Number of neighbouring frames whose median position shows jumps.
 _NEIGHBOURS = 9
 #: Number of iterations of the mean rotation.
@@ -101,9 +104,9 @@ class OrientationComparison:
 
     offset_s: float
     turn_wxyz: Float[np.ndarray, "4"]
-    reference_wxyz: Float[np.ndarray, "frames 4"]
-    difference_deg: Float[np.ndarray, "frames 3"]
-    angle_deg: Float[np.ndarray, "frames"]
+    reference_wxyz: _Quaternions
+    difference_deg: _Points
+    angle_deg: _Values
 
 
 @dataclass(frozen=True)
@@ -125,14 +128,14 @@ class PathComparison:
     """
 
     frame: Int[np.ndarray, "frames"]
-    time_s: Float[np.ndarray, "frames"]
-    position_m: Float[np.ndarray, "frames 3"]
+    time_s: _Values
+    position_m: _Points
     offset_s: float
     offset_std_s: float
     lever_arm_m: Float[np.ndarray, "3"]
-    reference_m: Float[np.ndarray, "frames 3"]
-    distance_m: Float[np.ndarray, "frames"]
-    distance_to_point_m: Float[np.ndarray, "frames"]
+    reference_m: _Points
+    distance_m: _Values
+    distance_to_point_m: _Values
     turning: OrientationComparison | None
 
     @property
@@ -327,19 +330,14 @@ def _without_jumps(path: Trajectories) -> Trajectories:
     return replace(path, status=status)
 
 
-def _at_frames(
-    body: Trajectories, path: Trajectories, later_s: float
-) -> Float[np.ndarray, "frames 4"] | None:
+def _at_frames(body: Trajectories, path: Trajectories, later_s: float) -> _Quaternions | None:
     """Orientations of the reference at the path's frames; None if it has none."""
     turned = resample(body, path.frame, path.time_s, later_s=later_s).orientation_wxyz
     return None if turned is None else turned[:, 0]
 
 
 def _compare_orientations(
-    pose_wxyz: Float[np.ndarray, "frames 4"],
-    body_wxyz: Float[np.ndarray, "frames 4"],
-    offset_s: float,
-    settings: PathSettings,
+    pose_wxyz: _Quaternions, body_wxyz: _Quaternions, offset_s: float, settings: PathSettings
 ) -> OrientationComparison:
     known = np.isfinite(body_wxyz).all(axis=-1)
     both = known & np.isfinite(pose_wxyz).all(axis=-1)
@@ -363,7 +361,7 @@ def _compare_orientations(
     )
 
 
-def _seen_orientations(path: Trajectories) -> Float[np.ndarray, "frames 4"] | None:
+def _seen_orientations(path: Trajectories) -> _Quaternions | None:
     if path.orientation_wxyz is None:
         return None
     return np.where(path.seen, path.orientation_wxyz[:, 0], np.nan)

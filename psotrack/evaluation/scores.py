@@ -26,18 +26,27 @@ from scipy.special import gammaincinv
 from psotrack.errors import InputError
 from psotrack.evaluation.tables import Consistency, Gospa, Hota, PathErrors
 from psotrack.support import similarity
-from psotrack.trajectories.association import GATE_M, UNASSIGNED, cheapest_partners, paired_values
+from psotrack.trajectories.association import (
+    GATE_M,
+    UNASSIGNED,
+    Distances,
+    Partners,
+    cheapest_partners,
+    paired_values,
+)
 
+_Quaternions = Float[np.ndarray, "frames drones 4"]
+_Vectors = Float[np.ndarray, "frames drones 3"]
+_Pairs = Int[np.ndarray, "2 pairs"]
+_Known = Bool[np.ndarray, "frames drones"]
+_Counted = Bool[np.ndarray, "frames estimates"]
+_Covariances = Float[np.ndarray, "frames drones 3 3"]
 _THRESHOLDS = np.linspace(0.05, 0.95, 19)
 #: Tolerance for rounding when a similarity is compared with a threshold.
 _EPSILON = np.finfo(float).eps
 
 
-def hota(
-    distance_m: Float[np.ndarray, "frames drones estimates"],
-    known: Bool[np.ndarray, "frames drones"],
-    counted: Bool[np.ndarray, "frames estimates"],
-) -> Hota:
+def hota(distance_m: Distances, known: _Known, counted: _Counted) -> Hota:
     """HOTA, DetA, AssA and LocA, each the mean over the thresholds.
 
     Each frame has one assignment for all thresholds. The assignment maximises the sum of similarities, each weighted by
@@ -86,8 +95,7 @@ def hota(
 
 
 def _track_fit(
-    similarity: Float[np.ndarray, "frames drones estimates"],
-    frames_of_both: Int[np.ndarray, "drones estimates"],
+    similarity: Distances, frames_of_both: Int[np.ndarray, "drones estimates"]
 ) -> Float[np.ndarray, "drones estimates"]:
     """Overlap of each drone with each track over all frames, in [0, 1], used as weight of the matching.
 
@@ -100,7 +108,7 @@ def _track_fit(
 
 
 def _frames_together(
-    matched: Bool[np.ndarray, "frames drones"], partners: Int[np.ndarray, "frames drones"], num_estimates: int
+    matched: _Known, partners: Partners, num_estimates: int
 ) -> Int[np.ndarray, "drones estimates"]:
     """Number of frames in which each pair is matched."""
     assigned = matched & (partners != UNASSIGNED)
@@ -110,11 +118,7 @@ def _frames_together(
     return together
 
 
-def gospa(
-    distance_m: Float[np.ndarray, "frames drones estimates"],
-    known: Bool[np.ndarray, "frames drones"],
-    counted: Bool[np.ndarray, "frames estimates"],
-) -> Gospa:
+def gospa(distance_m: Distances, known: _Known, counted: _Counted) -> Gospa:
     """GOSPA with alpha = 2, p = 2 and the cut-off c = `GATE_M`, and its three parts.
 
     In each frame, over all assignments (proposition 1 of the paper):
@@ -159,11 +163,11 @@ RPE_SPAN_S = 1.0
 
 
 def path_errors(
-    est_m: Float[np.ndarray, "frames drones 3"],
-    ref_m: Float[np.ndarray, "frames drones 3"],
-    orientation_est_wxyz: Float[np.ndarray, "frames drones 4"],
-    orientation_wxyz: Float[np.ndarray, "frames drones 4"],
-    later: Int[np.ndarray, "2 pairs"],
+    est_m: _Vectors,
+    ref_m: _Vectors,
+    orientation_est_wxyz: _Quaternions,
+    orientation_wxyz: _Quaternions,
+    later: _Pairs,
 ) -> PathErrors:
     """Compute ATE and RPE over the frames and drones where estimate and reference are known.
 
@@ -198,9 +202,7 @@ def path_errors(
     )
 
 
-def rows_apart(
-    frame: Int[np.ndarray, "frames"], time_s: Float[np.ndarray, "frames"]
-) -> Int[np.ndarray, "2 pairs"]:
+def rows_apart(frame: Int[np.ndarray, "frames"], time_s: Float[np.ndarray, "frames"]) -> _Pairs:
     """Rows of pairs of frames that are `RPE_SPAN_S` apart, rounded to whole frames, at least one frame.
 
     The distance is counted in frame numbers, so rows may be missing between the two.
@@ -215,9 +217,7 @@ def rows_apart(
 
 
 def _turn_errors_deg(
-    est_wxyz: Float[np.ndarray, "frames drones 4"],
-    ref_wxyz: Float[np.ndarray, "frames drones 4"],
-    later: Int[np.ndarray, "2 pairs"],
+    est_wxyz: _Quaternions, ref_wxyz: _Quaternions, later: _Pairs
 ) -> Float[np.ndarray, "turns"]:
     """Angles of (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), where all four orientations are known (Sturm et al., equation 2)."""
     first, second = later
@@ -239,10 +239,10 @@ INSIDE_90 = 2.0 * float(gammaincinv(3 / 2, 0.9))
 
 
 def consistency(
-    residual_m: Float[np.ndarray, "frames drones 3"],
-    centred_m: Float[np.ndarray, "frames drones 3"],
-    covariance_m2: Float[np.ndarray, "frames drones 3 3"],
-    relative_covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None,
+    residual_m: _Vectors,
+    centred_m: _Vectors,
+    covariance_m2: _Covariances,
+    relative_covariance_m2: _Covariances | None = None,
 ) -> Consistency:
     """Share of reference positions inside the estimate's 90 % ellipsoid, and mean NEES, over frames and drones.
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack import __version__
@@ -28,9 +28,10 @@ from psotrack.recordings import VideoWriter
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.raster import Pinhole
 from psotrack.simulation.imaging.renderer import CameraRenderer
-from psotrack.simulation.imaging.sensor import Sensor
+from psotrack.simulation.imaging.sensor import Image, Sensor
 from psotrack.simulation.scenarios import Scenario, SimulationSettings, Vector
 from psotrack.simulation.scene import Scene, build
+from psotrack.simulation.world.rooms import Point
 from psotrack.support import (
     Advance,
     Report,
@@ -42,8 +43,6 @@ from psotrack.support import (
 )
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.tum import write_tum
-
-Image = UInt8[np.ndarray, "height width 3"]
 
 #: White edge around the squares, metres.
 _EDGE_M = 0.03
@@ -73,7 +72,7 @@ class PosedBoard:
     """
 
     axes: Float[np.ndarray, "3 3"]
-    corner_m: Float[np.ndarray, "3"]
+    corner_m: Point
 
 
 def own_board() -> Board:
@@ -178,7 +177,7 @@ def _texture() -> Float[np.ndarray, "rows columns"]:
     return (_BLACK + framed.astype(np.float32) / 255 * (_WHITE - _BLACK)).astype(np.float32)
 
 
-def _in_view(rig: Rig, camera: int, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def _in_view(rig: Rig, camera: int, rng: np.random.Generator) -> Point:
     """A point somewhere in the image of a camera."""
     one = rig.cameras[camera]
     pixel = rng.uniform(0.06, 0.94, 2) * one.image_size_wh
@@ -351,7 +350,7 @@ def _write_tables(folder: Path, scene: Scene, rig: Rig, floor: PosedBoard, durat
     write_rows(folder / "truth" / "clocks.csv", [["camera", "video", "fps", "start_s"], *rows], separator=",")
 
 
-def moved(rig: Rig, origin_m: Float[np.ndarray, "3"]) -> Rig:
+def moved(rig: Rig, origin_m: Point) -> Rig:
     """The rig in a world with another origin and the same axes."""
     T = np.array(rig.cameras.T_cam_world)
     T[:, :3, 3] += T[:, :3, :3] @ origin_m

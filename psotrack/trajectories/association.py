@@ -15,6 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from psotrack.errors import InputError
 from psotrack.trajectories import Trajectories
 
+Distances = Float[np.ndarray, "frames drones estimates"]
+Partners = Int[np.ndarray, "frames drones"]
 #: Largest distance between an estimate and a reference drone that it can be assigned to in a frame, metres.
 GATE_M = 0.5
 #: Time from the first frame of the reference that decides the assignment for the whole run, seconds.
@@ -53,7 +55,7 @@ class AlignedPair:
     orientation_est_wxyz: Float[np.ndarray, "frames estimates 4"]
     covariance_m2: Float[np.ndarray, "frames estimates 3 3"]
     relative_covariance_m2: Float[np.ndarray, "frames estimates 3 3"]
-    distance_m: Float[np.ndarray, "frames drones estimates"]
+    distance_m: Distances
 
     @property
     def truth_known(self) -> Bool[np.ndarray, "frames drones"]:
@@ -150,9 +152,7 @@ def fixed_identity(pair: AlignedPair) -> Int[np.ndarray, "drones"]:
     return partner
 
 
-def partners_per_frame(
-    distance_m: Float[np.ndarray, "frames drones estimates"], *, keep: bool
-) -> Int[np.ndarray, "frames drones"]:
+def partners_per_frame(distance_m: Distances, *, keep: bool) -> Partners:
     """Partners in each frame: the largest number of pairs within `GATE_M`, and among these the least sum of distances.
 
     Args:
@@ -179,7 +179,7 @@ def partners_per_frame(
     return partners
 
 
-def cheapest_partners(cost: Float[np.ndarray, "frames drones estimates"]) -> Int[np.ndarray, "frames drones"]:
+def cheapest_partners(cost: Distances) -> Partners:
     """(frames, drones), partners with the least sum of costs in each frame; every possible partner is assigned.
 
     For metrics in which a bad pair costs as much as no pair.
@@ -191,9 +191,7 @@ def cheapest_partners(cost: Float[np.ndarray, "frames drones estimates"]) -> Int
     return partners
 
 
-def paired_values(
-    values: Float[np.ndarray, "frames drones estimates"], partners: Int[np.ndarray, "frames drones"]
-) -> Float[np.ndarray, "frames drones"]:
+def paired_values(values: Distances, partners: Partners) -> Float[np.ndarray, "frames drones"]:
     """(frames, drones), value of each reference drone with its partner of the frame; NaN without a partner."""
     if not values.shape[2]:
         return np.full(partners.shape, np.nan)
@@ -216,7 +214,7 @@ def fixed_partner_values(
     return picked
 
 
-def identity_switches(partners: Int[np.ndarray, "frames drones"]) -> Bool[np.ndarray, "frames drones"]:
+def identity_switches(partners: Partners) -> Bool[np.ndarray, "frames drones"]:
     """(frames, drones), True where a reference drone's partner differs from its previous partner."""
     switched = np.zeros(partners.shape, bool)
     last = np.full(partners.shape[1], UNASSIGNED)

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from psotrack.geometry import rotation_matrices as rotation_matrices
 from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 
+_Times = Float[np.ndarray, "times"]
+_Samples = Float[np.ndarray, "samples"]
 #: Longest gap over which positions are interpolated, seconds; for slow trajectories 1.5 sample intervals.
 MAX_GAP_S = 0.1
 #: Largest turn between two samples between which orientations are interpolated, radians.
@@ -22,7 +24,7 @@ _MOST_TURN = np.deg2rad(150)
 #: Times nearer than this are one time, seconds.
 _SAME_S = 1e-9
 
-_At = Callable[[Float[np.ndarray, "times"]], np.ndarray]
+_At = Callable[[_Times], np.ndarray]
 
 
 def resample(
@@ -58,10 +60,7 @@ def resample(
 
 
 def _turned(
-    time_s: Float[np.ndarray, "samples"],
-    orientation_wxyz: Float[np.ndarray, "samples 4"],
-    wanted_s: Float[np.ndarray, "times"],
-    longest_s: float,
+    time_s: _Samples, orientation_wxyz: Float[np.ndarray, "samples 4"], wanted_s: _Times, longest_s: float
 ) -> Float[np.ndarray, "times 4"]:
     """Orientations of one drone at other times, by a spline through each piece without a gap or a large turn."""
     found = np.full((len(wanted_s), 4), np.nan)
@@ -112,14 +111,12 @@ def merged(
     return Trajectories(frame, time_of(frame).astype(np.float64), drones, **known)
 
 
-def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
+def longest_gap_s(time_s: _Samples) -> float:
     """Longest gap between samples over which positions are interpolated, seconds."""
     return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s)))) if len(time_s) > 1 else MAX_GAP_S
 
 
-def between_samples(
-    sample_s: Float[np.ndarray, "samples"], wanted_s: Float[np.ndarray, "times"], longest_s: float
-) -> Bool[np.ndarray, "times"]:
+def between_samples(sample_s: _Samples, wanted_s: _Times, longest_s: float) -> Bool[np.ndarray, "times"]:
     """Say which times are at a sample, or between two samples that are at most `longest_s` apart.
 
     Args:
@@ -134,7 +131,7 @@ def between_samples(
     return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < _SAME_S)
 
 
-def interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray, gap_s: float | None = None) -> _At:
+def interpolated(time_s: _Samples, values: np.ndarray, gap_s: float | None = None) -> _At:
     """A function that interpolates values (samples, drones, ...) by cubic splines.
 
     It takes times (times,) and returns values (times, drones, ...), NaN outside of the samples and in gaps that are
@@ -150,7 +147,7 @@ def interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray, gap_s
         if there.sum() > 1
     }
 
-    def at(wanted_s: Float[np.ndarray, "times"]) -> np.ndarray:
+    def at(wanted_s: _Times) -> np.ndarray:
         found = np.full((len(wanted_s), *flat.shape[1:]), np.nan)
         for drone, (sample_s, spline) in splines.items():
             inside = between_samples(sample_s, wanted_s, longest_s)

@@ -14,6 +14,7 @@ from psotrack.recordings import ImageViews, ellipse_outlines_px
 from psotrack.show.flights import FlightTracks, status_rgb, statuses
 from psotrack.trajectories import Status
 
+Image = UInt8[np.ndarray, "height width 3"]
 #: How much white is mixed into the colours, which stand before images.
 _LIGHTER = 0.2
 #: Fractional bits of the coordinates that OpenCV draws at.
@@ -80,7 +81,7 @@ def places_in(views: ImageViews, camera: int) -> ImagePlaces:
 
 
 def draw_drones(
-    image: UInt8[np.ndarray, "height width 3"],
+    image: Image,
     tracks: DrawnTracks,
     places: ImagePlaces,
     row: int,
@@ -122,16 +123,13 @@ def draw_drones(
             )
 
 
-def line_width_px(image: UInt8[np.ndarray, "height width 3"]) -> int:
+def line_width_px(image: Image) -> int:
     """Width of lines, which grows with the image."""
     return max(1, round(image.shape[1] / _LINE_WIDTH_PX))
 
 
 def draw_line(
-    image: UInt8[np.ndarray, "height width 3"],
-    points_px: Float[np.ndarray, "points 2"],
-    colour: tuple[int, int, int],
-    width_px: int,
+    image: Image, points_px: Float[np.ndarray, "points 2"], colour: tuple[int, int, int], width_px: int
 ) -> None:
     """Draw a line through those of some points that are known."""
     known_px = points_px[np.isfinite(points_px).all(axis=1)]
@@ -143,7 +141,7 @@ def draw_line(
 
 
 def write_text(
-    image: UInt8[np.ndarray, "height width 3"],
+    image: Image,
     words: str,
     place_px: tuple[float, float] = (0.0, 0.0),
     colour: tuple[int, int, int] = _WHITE,
@@ -185,7 +183,7 @@ class MapView:
         px_per_m: pixels per metre; x goes to the right, y upwards.
     """
 
-    background: UInt8[np.ndarray, "height width 3"]
+    background: Image
     origin_px: Float[np.ndarray, "2"]
     px_per_m: float
 
@@ -215,9 +213,7 @@ def make_map(rig: Rig, tracks: Sequence[DrawnTracks], size_wh: tuple[int, int]) 
     return view
 
 
-def draw_map(
-    view: MapView, tracks: Sequence[DrawnTracks], row: Sequence[int], trail_rows: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def draw_map(view: MapView, tracks: Sequence[DrawnTracks], row: Sequence[int], trail_rows: int) -> Image:
     """The map at one moment.
 
     Args:

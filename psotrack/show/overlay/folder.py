@@ -29,6 +29,7 @@ from psotrack.recordings import (
 from psotrack.show.flights import TrackedFlight, rows_at
 from psotrack.show.overlay.drawing import (
     DrawnTracks,
+    Image,
     ImagePlaces,
     MapView,
     draw_drones,
@@ -51,6 +52,7 @@ from psotrack.support import (
     write_json,
 )
 
+_Tile = UInt8[np.ndarray, "_ _ 3"]
 #: Time for which a drone's trail is shown, seconds.
 TRAIL_S = 2.0
 
@@ -105,9 +107,7 @@ class DrawnVideo:
         columns = int(np.ceil(np.sqrt(count)))
         return columns, -(-count // columns)
 
-    def image(
-        self, instant: int, frames: Sequence[UInt8[np.ndarray, "_ _ 3"] | None]
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def image(self, instant: int, frames: Sequence[_Tile | None]) -> Image:
         """What is shown at an instant, of the cameras' frames."""
         (columns, lines), (width, height) = self.columns_lines, self.tile_wh
         image = np.zeros((lines * height, columns * width, 3), np.uint8)
@@ -125,13 +125,8 @@ class DrawnVideo:
         return image
 
     def _tile(
-        self,
-        camera: DrawnCamera,
-        frame: UInt8[np.ndarray, "_ _ 3"] | None,
-        row: Sequence[int],
-        trail_rows: int,
-        words: str,
-    ) -> UInt8[np.ndarray, "_ _ 3"]:
+        self, camera: DrawnCamera, frame: _Tile | None, row: Sequence[int], trail_rows: int, words: str
+    ) -> _Tile:
         """A camera's frame at its drawn size, with what was found in it."""
         if frame is None:
             return np.zeros((*camera.size_wh[::-1], 3), np.uint8)
@@ -167,7 +162,7 @@ def write_video(task: tuple[Path, DrawnVideo], advance: Advance) -> None:
             advance(1)
 
 
-def _frames(video: VideoInfo, numbers: Sequence[int]) -> Iterator[UInt8[np.ndarray, "_ _ 3"] | None]:
+def _frames(video: VideoInfo, numbers: Sequence[int]) -> Iterator[_Tile | None]:
     """The frames with some numbers, which do not decrease; None for -1."""
     following, at, image = read_frames(video), -1, None
     for number in numbers:

@@ -31,6 +31,8 @@ from psotrack.show.flights import FlightTracks, TrackedFlight, ellipsoids_90, fl
 from psotrack.support import atomic_write, refuse_to_overwrite, short_repr
 from psotrack.trajectories import Status, Trajectories
 
+_Point = Float[np.ndarray, "3"]
+_Rows = Float[np.ndarray, "rows"]
 #: Largest size of a page, bytes: what e-mail and chat programs take as an attachment.
 MOST_BYTES = 8_000_000
 #: Height of a 3D view in a notebook, pixels.
@@ -150,7 +152,7 @@ def view_3d(tracks: TrackedRecording | Trajectories, recording: Recording | None
     return View3D(flight_of(tracks, recording))
 
 
-def shown_times_s(flight: TrackedFlight) -> Float[np.ndarray, "rows"]:
+def shown_times_s(flight: TrackedFlight) -> _Rows:
     """Times of the rows of a flight: of its first tracks, else of its reference, else of its recording."""
     first = flight.tracks[0].trajectories if flight.tracks else flight.truth
     if first is not None:
@@ -185,7 +187,7 @@ def scene_data(flight: TrackedFlight) -> dict[str, Any]:
     }
 
 
-def _bounds_m(flight: TrackedFlight) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _bounds_m(flight: TrackedFlight) -> tuple[_Point, _Point]:
     """Lowest and highest coordinates of all that is shown, and of the floor, z = 0, if it is near."""
     parts = [each.trajectories.position_m[each.trajectories.seen] for each in flight.tracks]
     if flight.truth is not None:
@@ -203,9 +205,7 @@ def _bounds_m(flight: TrackedFlight) -> tuple[Float[np.ndarray, "3"], Float[np.n
     return low_m, high_m
 
 
-def _drones(
-    tracks: FlightTracks, time_s: Float[np.ndarray, "rows"], origin_m: Float[np.ndarray, "3"]
-) -> list[dict[str, Any]]:
+def _drones(tracks: FlightTracks, time_s: _Rows, origin_m: _Point) -> list[dict[str, Any]]:
     flown = tracks.trajectories
     position_m = np.where(flown.seen[..., None], flown.position_m, np.nan)
     status = np.where(flown.seen, statuses(flown), Status.LOST)
@@ -230,7 +230,7 @@ def _drones(
 
 
 def _at_times(
-    trajectories: Trajectories, time_s: Float[np.ndarray, "rows"], values: np.ndarray
+    trajectories: Trajectories, time_s: _Rows, values: np.ndarray
 ) -> Float[np.ndarray, "rows *rest"]:
     """Values in the rows of a scene: those of the nearest frame, NaN where no frame is near."""
     rows = rows_at(trajectories, time_s)
@@ -239,7 +239,7 @@ def _at_times(
     return found
 
 
-def _cameras(rig: Rig, origin_m: Float[np.ndarray, "3"], length_m: float) -> list[dict[str, Any]]:
+def _cameras(rig: Rig, origin_m: _Point, length_m: float) -> list[dict[str, Any]]:
     """Centre of each camera, and the four corners of a pyramid that opens along its view, without distortion."""
     cameras = []
     for index, name in enumerate(rig.names):

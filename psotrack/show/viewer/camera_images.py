@@ -29,6 +29,8 @@ from psotrack.recordings import VideoInfo, read_frames
 from psotrack.show.flights import TrackedFlight
 from psotrack.support import Report, no_progress
 
+_Coverage = UInt8[np.ndarray, "height width"]
+_Image = UInt8[np.ndarray, "height width 3"]
 #: Quality of JPEG with which the size of images is planned, and its limits while images are written.
 _QUALITY, _LEAST_QUALITY, _BEST_QUALITY = 75, 20, 90
 #: Change of the quality from image to image, where the images so far are larger or smaller than planned.
@@ -171,9 +173,7 @@ def encode_images(source: ImageSource) -> Iterator[EncodedImage]:
         quality = int(np.clip(quality + change, _LEAST_QUALITY, _BEST_QUALITY))
 
 
-def _reduced(
-    image: UInt8[np.ndarray, "height width 3"], reduction: int
-) -> UInt8[np.ndarray, "rows columns 3"]:
+def _reduced(image: _Image, reduction: int) -> UInt8[np.ndarray, "rows columns 3"]:
     """An image of 1 / reduction of the width and height: means over squares, which OpenCV computes quickly."""
     if reduction == 1:
         return image
@@ -182,11 +182,11 @@ def _reduced(
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _jpeg(image: UInt8[np.ndarray, "height width 3"], quality: int) -> bytes:
+def _jpeg(image: _Image, quality: int) -> bytes:
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
 
 
-def _read_coverages(silhouettes: Any, frames: range) -> Iterator[UInt8[np.ndarray, "height width"]]:
+def _read_coverages(silhouettes: Any, frames: range) -> Iterator[_Coverage]:
     """Yield the silhouettes of some frames; frames that are compressed together are read together."""
     for first in range(0, 0 if silhouettes is None else silhouettes.shape[0], _READ_FRAMES):
         chunk = None
@@ -196,7 +196,7 @@ def _read_coverages(silhouettes: Any, frames: range) -> Iterator[UInt8[np.ndarra
                 yield chunk[frame - first]
 
 
-def _silhouette_png(coverage: UInt8[np.ndarray, "height width"]) -> bytes:
+def _silhouette_png(coverage: _Coverage) -> bytes:
     """An image that is as opaque as a cell is covered."""
     # Pixels of four bytes as one number each, which NumPy looks up quickly.
     bgra = _silhouette_colours()[coverage].view(np.uint8).reshape(*coverage.shape, 4)
@@ -212,7 +212,7 @@ def _silhouette_colours() -> UInt32[np.ndarray, "256"]:
     return table.view(np.uint32).ravel()
 
 
-def _blob_boxes_px(coverage: UInt8[np.ndarray, "height width"], cell_px: int) -> Float[np.ndarray, "blobs 4"]:
+def _blob_boxes_px(coverage: _Coverage, cell_px: int) -> Float[np.ndarray, "blobs 4"]:
     height, width = coverage.shape
     blobs = find_blobs(coverage, cell_px, np.array([width, height]))
     half_px = blobs.size_px / 2

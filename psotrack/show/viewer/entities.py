@@ -37,6 +37,7 @@ from psotrack.show.flights import (
 from psotrack.show.viewer.camera_images import CameraKey
 from psotrack.trajectories import Status
 
+_Counts = Int[np.ndarray, " rows"]
 #: Timelines: seconds of the recording, and numbers of instants.
 TIME, FRAME = "time", "frame"
 #: Rows that are sent together: Rerun keeps what is sent together in one piece.
@@ -53,7 +54,7 @@ class Instants(NamedTuple):
         time_s: (rows,), times of the instants, seconds.
     """
 
-    frame: Int[np.ndarray, " rows"]
+    frame: _Counts
     time_s: Float[np.ndarray, " rows"]
 
 
@@ -77,14 +78,7 @@ class EntityLog:
             self._logged.add(key)
             self._stream.log(path, values, static=True, strict=True)
 
-    def rows(
-        self,
-        path: str,
-        at: Instants,
-        kind: Any,
-        counts: Int[np.ndarray, " rows"] | None = None,
-        **values: Any,
-    ) -> None:
+    def rows(self, path: str, at: Instants, kind: Any, counts: _Counts | None = None, **values: Any) -> None:
         """Log values over time, in pieces.
 
         Args:
@@ -113,7 +107,7 @@ class EntityLog:
         self,
         path: str,
         at: Instants,
-        counts: Int[np.ndarray, " rows"],
+        counts: _Counts,
         boxes_px: Float[np.ndarray, "boxes 4"],
         rgb: Any,
         labels: list[str] | None = None,
@@ -130,7 +124,7 @@ class EntityLog:
         self,
         path: str,
         at: Instants,
-        counts: Int[np.ndarray, " rows"],
+        counts: _Counts,
         lines_px: Float[np.ndarray, "lines points 2"],
         rgb: Any,
         labels: list[str] | None = None,

@@ -24,6 +24,8 @@ from psotrack.recordings.exchange import read_tracks
 from psotrack.simulation.scenarios import FlightFromFile
 from psotrack.trajectories import Trajectories, write_trajectories
 
+Turns = Float[np.ndarray, "times 3 3"]
+_Quaternions = Float[np.ndarray, "samples 4"]
 GRAVITY_M_S2 = 9.81
 
 Times = Float[np.ndarray, "times"]
@@ -39,14 +41,12 @@ class Heading:
     angular_rad_s: float = 1.0
     phase_rad: float = 0.0
 
-    def at(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
+    def at(self, time_s: Times) -> Times:
         """(times,), heading at each time, radians."""
         return self.yaw_rad + self.sway_rad * np.sin(self.angular_rad_s * time_s + self.phase_rad)
 
 
-def attitude(
-    thrust_m_s2: Float[np.ndarray, "times 3"], yaw_rad: Float[np.ndarray, "times"]
-) -> Float[np.ndarray, "times 3 3"]:
+def attitude(thrust_m_s2: Vectors, yaw_rad: Times) -> Turns:
     """(times, 3, 3), body to world: z along the thrust, x as near to the heading as possible."""
     body_z = thrust_m_s2 / np.linalg.norm(thrust_m_s2, axis=-1, keepdims=True)
     ahead = np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros_like(yaw_rad)], axis=-1)
@@ -55,7 +55,7 @@ def attitude(
     return np.stack([np.cross(body_y, body_z), body_y, body_z], axis=-1)
 
 
-def quaternions_wxyz(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times 4"]:
+def quaternions_wxyz(rotation: Turns) -> Float[np.ndarray, "times 4"]:
     """(times, 4), unit quaternions, scalar first; their signs do not change from one time to the next."""
     wxyz = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
     # `np.sign` would be 0 after half a turn.
@@ -88,16 +88,16 @@ class Flight(ABC):
         """(times, 3), world, gravity not included."""
         return self.derivative(time_s, 2)
 
-    def rotation(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
+    def rotation(self, time_s: Times) -> Turns:
         """(times, 3, 3), body to world: z along a + g, x as near to the heading as possible."""
         thrust_m_s2 = self.acceleration_m_s2(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
         return attitude(thrust_m_s2, self.heading.at(time_s))
 
-    def tilt_deg(self, time_s: Times) -> Float[np.ndarray, "times"]:
+    def tilt_deg(self, time_s: Times) -> Times:
         """(times,), angle between the body's z axis and the vertical, degrees."""
         return np.degrees(np.arccos(np.clip(self.rotation(time_s)[:, 2, 2], -1, 1)))
 
-    def orientation_wxyz(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 4"]:
+    def orientation_wxyz(self, time_s: Times) -> Float[np.ndarray, "times 4"]:
         """(times, 4), unit quaternions, body to world; their signs do not change from one time to the next."""
         return quaternions_wxyz(self.rotation(time_s))
 
@@ -285,9 +285,9 @@ class Recorded:
         orientation_wxyz: (samples, 4), unit quaternions that turn body into world coordinates, or None.
     """
 
-    time_s: Float[np.ndarray, "samples"]
-    position_m: Float[np.ndarray, "samples 3"]
-    orientation_wxyz: Float[np.ndarray, "samples 4"] | None
+    time_s: Samples
+    position_m: Positions
+    orientation_wxyz: _Quaternions | None
 
     @property
     def duration_s(self) -> float:
@@ -320,10 +320,7 @@ def read_recorded_flight(path: str | Path) -> Recorded:
 
 
 def write_recorded_flight(
-    path: str | Path,
-    time_s: Float[np.ndarray, "samples"],
-    position_m: Float[np.ndarray, "samples 3"],
-    orientation_wxyz: Float[np.ndarray, "samples 4"] | None,
+    path: str | Path, time_s: Samples, position_m: Positions, orientation_wxyz: _Quaternions | None
 ) -> None:
     """Write the tracks of one drone, .csv or .parquet, with all digits, so that reading gives the same numbers.
 
@@ -426,7 +423,7 @@ class RecordedFlight(Flight):
         )
         return sum(terms, self.offset_m * (order == 0))
 
-    def rotation(self, time_s: Times) -> Float[np.ndarray, "times 3 3"]:
+    def rotation(self, time_s: Times) -> Turns:
         """(times, 3, 3), body to world: as recorded, or from the acceleration if no orientations were recorded."""
         if self._attitude is None:
             return super().rotation(time_s)

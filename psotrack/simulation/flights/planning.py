@@ -24,6 +24,7 @@ from psotrack.simulation.flights.motion import (
     HarmonicFlight,
     Heading,
     RelativeFlight,
+    Times,
     WaypointFlight,
     recorded_flight,
 )
@@ -306,9 +307,7 @@ class Excess(NamedTuple):
     time_s: float
 
 
-def excess(
-    flights: tuple[Flight, ...], scenario: Scenario, time_s: Float[np.ndarray, "times"]
-) -> Excess | None:
+def excess(flights: tuple[Flight, ...], scenario: Scenario, time_s: Times) -> Excess | None:
     """Find the first limit that the flights violate at any of the given times; None if they keep all limits.
 
     The limits are checked in the order bounds, speed, acceleration, tilt, distance. The distance of two drones in a
@@ -326,7 +325,7 @@ def excess(
 
 
 def _measured(
-    flights: tuple[Flight, ...], scenario: Scenario, time_s: Float[np.ndarray, "times"]
+    flights: tuple[Flight, ...], scenario: Scenario, time_s: Times
 ) -> Iterator[
     tuple[int, Float[np.ndarray, "drones times"], str, Float[np.ndarray, "drones times *values"], str]
 ]:
@@ -336,7 +335,7 @@ def _measured(
     outside_m = np.maximum(limits.lower_m - position_m, position_m - limits.upper_m).max(axis=-1)
     bounds = f"{list(limits.lower_m)} (limits.lower_m) to {list(limits.upper_m)} (limits.upper_m)"
     yield 0, outside_m, f"positions from {bounds}", position_m, ""
-    measures: dict[str, tuple[str, Callable[[Flight], Float[np.ndarray, "times"]]]] = {
+    measures: dict[str, tuple[str, Callable[[Flight], Times]]] = {
         "max_speed_m_s": ("m/s", lambda flight: norm(flight.velocity_m_s(time_s), axis=-1)),
         "max_acceleration_m_s2": ("m/s2", lambda flight: norm(flight.acceleration_m_s2(time_s), axis=-1)),
         "max_tilt_deg": ("degrees of tilt", lambda flight: flight.tilt_deg(time_s)),

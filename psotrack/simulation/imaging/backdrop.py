@@ -15,9 +15,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
-from psotrack.simulation.imaging.raster import Pinhole, RasterView, draw, empty_buffers, full_view
+from psotrack.simulation.imaging.raster import (
+    Depth,
+    Matrix,
+    Pinhole,
+    RasterView,
+    draw,
+    empty_buffers,
+    full_view,
+)
 from psotrack.simulation.scenarios import Imaging
-from psotrack.simulation.world.rooms import Room, Surface
+from psotrack.simulation.world.rooms import Point, Room, Surface
 
 #: Samples per pixel along each side, for anti-aliasing.
 _MAGNIFICATION = 2
@@ -67,7 +75,7 @@ def render_light(
 
 def numbers_and_depth(
     surfaces: Sequence[Surface], view: RasterView
-) -> tuple[Int[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+) -> tuple[Int[np.ndarray, "rows columns"], Depth]:
     """Index of the visible surface at each pixel, -1 without a surface, and its depth along the optical axis."""
     corners = np.stack([surface.corners_m for surface in surfaces])
     triangles = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
@@ -82,7 +90,7 @@ def lens_blur(light: Float[np.ndarray, "*shape"], sigma_px: float) -> Float[np.n
     return cv2.GaussianBlur(light, (0, 0), sigma_px) if sigma_px > 0 else light
 
 
-def texel_to_camera(surface: Surface, cam: Pinhole) -> Float[np.ndarray, "3 3"]:
+def texel_to_camera(surface: Surface, cam: Pinhole) -> Matrix:
     """(3, 3), matrix from a texel (column, row, 1) to the camera coordinates of the texel's point on the surface."""
     rows, columns = surface.texture.shape[:2]
     edges = [cam.R @ edge for edge in (surface.along_m, surface.down_m)]
@@ -109,7 +117,7 @@ class _Tree:
         behind: surfaces on the other side; None for none.
     """
 
-    normal: Float[np.ndarray, "3"]
+    normal: Point
     offset_m: float
     inside: list[int]
     before: _Tree | None
@@ -135,7 +143,7 @@ class _Tree:
         inside = chosen[~(above | below)].tolist()
         return cls(normals[chosen[best]], float(offset_m[best]), inside, *sides)
 
-    def far_to_near(self, eye_m: Float[np.ndarray, "3"]) -> Iterator[int]:
+    def far_to_near(self, eye_m: Point) -> Iterator[int]:
         """Yield all surfaces in an order in which none is hidden by an earlier one, seen from a point."""
         sides = [self.behind, self.before]
         far, near = sides if self.normal @ eye_m > self.offset_m else sides[::-1]
@@ -150,7 +158,7 @@ LIGHT_UNIT = 16384
 #: BGR light, and the floor's share of the light. OpenCV transforms four channels faster than three.
 Light = UInt16[np.ndarray, "rows columns 4"]
 #: A texture at one resolution, and the matrix from its texels to the texels at full resolution.
-Level = tuple[Light, Float[np.ndarray, "3 3"]]
+Level = tuple[Light, Matrix]
 
 #: Smallest side of a texture's coarsest level, texels.
 _SMALLEST_PX = 8
@@ -216,9 +224,7 @@ class RoomPainter:
         eye_m = -view.cam.R.T @ view.cam.t_m
         return ((eye_m - self._corners_m[:, 0]) * self._normals).sum(axis=-1)
 
-    def hiding_depth_m(
-        self, view: RasterView, faces_m: Float[np.ndarray, "faces 3 3"]
-    ) -> Float[np.ndarray, "rows columns"]:
+    def hiding_depth_m(self, view: RasterView, faces_m: Float[np.ndarray, "faces 3 3"]) -> Depth:
         """(rows, columns), depth of the surfaces that may hide the given faces; `FAR_M` at pixels without a surface."""
         points = faces_m.reshape(-1, 3)
         lower, upper = points.min(axis=0), points.max(axis=0)
@@ -234,7 +240,7 @@ class RoomPainter:
         view: RasterView,
         index: int,
         corners: Float[np.ndarray, "corners 3"],
-        normal_per_height: Float[np.ndarray, "3"],
+        normal_per_height: Point,
     ) -> None:
         K = view.K
         to_rays = np.linalg.inv(K)
@@ -270,11 +276,7 @@ class RoomPainter:
                 nearest = farthest
 
     def _fill(
-        self,
-        image: Light,
-        spans: _Spans,
-        level: UInt16[np.ndarray, "texels_y texels_x 4"],
-        H: Float[np.ndarray, "3 3"],
+        self, image: Light, spans: _Spans, level: UInt16[np.ndarray, "texels_y texels_x 4"], H: Matrix
     ) -> None:
         """Paint a level of a texture into spans; H maps texels to pixels."""
         x1, x2 = int(spans.left.min()), int(spans.right.max()) + 1
@@ -316,7 +318,7 @@ def _levels(surface: Surface, is_floor: bool) -> list[Level]:
 
 
 def may_be_seen(
-    corners: Float[np.ndarray, "surfaces corners 3"], K: Float[np.ndarray, "3 3"], shape: tuple[int, int]
+    corners: Float[np.ndarray, "surfaces corners 3"], K: Matrix, shape: tuple[int, int]
 ) -> Bool[np.ndarray, "surfaces"]:
     """(surfaces,), False if all corners of a surface are beyond one side of the image or behind the camera."""
     x, y, depth = np.moveaxis(corners @ K.T, -1, 0)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur, numbers_and_depth, render_light
@@ -23,17 +23,21 @@ from psotrack.simulation.imaging.raster import (
     MIRRORED,
     Pinhole,
     PosedDrone,
+    Samples,
     average,
     full_view,
     margin_px,
     windows,
 )
-from psotrack.simulation.imaging.sensor import GAMMA
+from psotrack.simulation.imaging.sensor import GAMMA, Image, Light
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import DroneModel, disc_fans
-from psotrack.simulation.world.rooms import AMBIENT, Room
+from psotrack.simulation.world.rooms import AMBIENT, Point, Room
 
+_Pixels = Float[np.ndarray, "height width"]
+_Outline = Float[np.ndarray, "side side"]
+_Cells = Float[np.ndarray, "rows columns"]
 #: Standard deviation of the direction of mirrored light.
 ROUGHNESS_RAD = 0.006
 #: Indices of the passes in which mirror images are drawn. Four of eight passes are enough, because mirror images are
@@ -55,26 +59,20 @@ class Mirror:
     """
 
     cam: Pinhole
-    share: Float[np.ndarray, "height width"]
-    light: Float[np.ndarray, "height width 3"]
-    depth_m: Float[np.ndarray, "height width"]
+    share: _Pixels
+    light: Light
+    depth_m: _Pixels
 
     def on(self, empty: Backdrop) -> Backdrop:
         """Empty room with its mirror image in the floor."""
         share = self.share[..., None]
         return replace(empty, light=(1 - share) * empty.light + share * self.light)
 
-    def share_of_rest(self, light: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+    def share_of_rest(self, light: Light) -> _Pixels:
         """(height, width), share of each pixel's light that is not mirrored."""
         return 1 - self.share * self.light.sum(axis=-1) / np.maximum(light.sum(axis=-1), 1e-6)
 
-    def reflect(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],
-        posed: list[PosedDrone],
-        samples: Float[np.ndarray, "passes 3"],
-        lens_blur_px: float,
-    ) -> None:
+    def reflect(self, image: Image, posed: list[PosedDrone], samples: Samples, lens_blur_px: float) -> None:
         """Add the mirror images of drones to an image of the room and its mirror image."""
         passes = [index for index in _PASSES if index < len(samples)]
         samples = samples[passes] - samples[passes].mean(axis=0)
@@ -129,7 +127,7 @@ def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.n
     return at_normal + (1 - at_normal) * (1 - cosine) ** 5
 
 
-def _cosine_to_floor(cam: Pinhole) -> Float[np.ndarray, "height width"]:
+def _cosine_to_floor(cam: Pinhole) -> _Pixels:
     """(height, width), cosine of the angle between the line of sight and the floor's normal; 0 above the horizon."""
     to_world = (cam.R.T @ np.linalg.inv(cam.K)).astype(np.float32)
     x, y = np.arange(cam.width, dtype=np.float32), np.arange(cam.height, dtype=np.float32)[:, None]
@@ -137,12 +135,7 @@ def _cosine_to_floor(cam: Pinhole) -> Float[np.ndarray, "height width"]:
     return np.clip(-rays[2] / np.sqrt(rays[0] ** 2 + rays[1] ** 2 + rays[2] ** 2), 0, 1)
 
 
-def _blurred(
-    light: Float[np.ndarray, "height width 3"],
-    beyond: Float[np.ndarray, "height width"],
-    sigma_px: float,
-    imaging: Imaging,
-) -> Float[np.ndarray, "height width 3"]:
+def _blurred(light: Light, beyond: _Pixels, sigma_px: float, imaging: Imaging) -> Light:
     """Blurred light of the mirrored room; the blur is 0 at the floor and grows with the distance behind the mirror."""
     mixed = np.zeros_like(light)
     for step in range(_BLURS):
@@ -181,7 +174,7 @@ class FloorLight:
         """(3, 3), matrix from a cell (column, row, 1) to its pixel."""
         return cam.K @ (cam.R @ self._cell_to_world + np.outer(cam.t_m, [0, 0, 1]))
 
-    def floor_gain(self, time_s: float) -> Float[np.ndarray, "rows columns"]:
+    def floor_gain(self, time_s: float) -> _Cells:
         """(rows, columns), share of light that reaches each cell of the floor at a time."""
         gain = np.ones(self._shape, np.float32)
         time = np.array([time_s])
@@ -189,13 +182,7 @@ class FloorLight:
             self._cast(gain, outline, flight.position_m(time)[0], flight.rotation(time)[0, :2, :2])
         return gain
 
-    def _cast(
-        self,
-        gain: Float[np.ndarray, "rows columns"],
-        outline: Float[np.ndarray, "side side"],
-        position: Float[np.ndarray, "3"],
-        turn: Float[np.ndarray, "2 2"],
-    ) -> None:
+    def _cast(self, gain: _Cells, outline: _Outline, position: Point, turn: Float[np.ndarray, "2 2"]) -> None:
         panels = self._scene.room.panels
         lamp_height = float(panels.centres_m[0, 2])
         magnified = lamp_height / (lamp_height - position[2])
@@ -211,12 +198,7 @@ class FloorLight:
         for fall, weight in zip(falls, direct.diagonal() / (direct.sum(axis=0) + AMBIENT), strict=True):
             self._stamp(gain, float(weight) * patch, fall)
 
-    def _stamp(
-        self,
-        gain: Float[np.ndarray, "rows columns"],
-        patch: Float[np.ndarray, "side side"],
-        at_m: Float[np.ndarray, "3"],
-    ) -> None:
+    def _stamp(self, gain: _Cells, patch: _Outline, at_m: Point) -> None:
         """Remove the share of light that a patch gives, centred at a point of the floor."""
         centre = np.array([at_m[0] - self._corner_m[0], self._corner_m[1] - at_m[1]]) / _CELL_M - 0.5
         half = len(patch) // 2 + 1
@@ -244,7 +226,7 @@ class FloorShadows(FloorLight):
         matt = backdrop.floor if mirror is None else backdrop.floor * mirror.share_of_rest(backdrop.light)
         self._matt = (255 * matt[self._window]).round().astype(np.uint8)
 
-    def cast(self, image: UInt8[np.ndarray, "height width 3"], time_s: float) -> None:
+    def cast(self, image: Image, time_s: float) -> None:
         """Darken the floor in an image by the shadows at a time."""
         part = image[self._window]
         if not part.size or not self._scene.scenario.imaging.shadows:
@@ -259,7 +241,7 @@ class FloorShadows(FloorLight):
             cv2.multiply(part, cv2.merge([darker, darker, darker]), dst=part, scale=1 / 255)
 
 
-def _outline(shape: DroneModel) -> Float[np.ndarray, "side side"]:
+def _outline(shape: DroneModel) -> _Outline:
     """(side, side), share of light that a drone blocks, seen from above, in cells of `_FINE_M`; x right, y up."""
     half = int(np.ceil(shape.radius_m / _FINE_M)) + 1
     outline = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
@@ -271,10 +253,7 @@ def _outline(shape: DroneModel) -> Float[np.ndarray, "side side"]:
 
 
 def _turn_outline(
-    outline: Float[np.ndarray, "side side"],
-    turn: Float[np.ndarray, "2 2"],
-    magnified: float,
-    margin_m: float,
+    outline: _Outline, turn: Float[np.ndarray, "2 2"], magnified: float, margin_m: float
 ) -> Float[np.ndarray, "cells cells"]:
     """(cells, cells), outline turned, magnified and resampled to the floor's cells, centred."""
     half = int((len(outline) * _FINE_M * magnified / 2 + margin_m) / _CELL_M) + 2

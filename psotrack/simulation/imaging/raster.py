@@ -22,6 +22,12 @@ from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import disc_fans
 
+Depth = Float[np.ndarray, "rows columns"]
+_Faces = Float[np.ndarray, "faces 3 3"]
+Matrix = Float[np.ndarray, "3 3"]
+Samples = Float[np.ndarray, "passes 3"]
+_Seen = Float[np.ndarray, "rows columns 4"]
+_Colour = Float[np.ndarray, "rows columns 3"]
 #: Smallest and largest depth that is drawn.
 NEAR_M = 0.1
 FAR_M = 100.0
@@ -39,9 +45,9 @@ class Pinhole:
         height: height of the image, pixels.
     """
 
-    R: Float[np.ndarray, "3 3"]
+    R: Matrix
     t_m: Float[np.ndarray, "3"]
-    K: Float[np.ndarray, "3 3"]
+    K: Matrix
     width: int
     height: int
 
@@ -106,7 +112,7 @@ class RasterView:
         return replace(self, x=x, y=y, width=right - x, height=bottom - y)
 
     @property
-    def K(self) -> Float[np.ndarray, "3 3"]:
+    def K(self) -> Matrix:
         """(3, 3), matrix from camera coordinates to the buffer's pixels, whose centres have integer coordinates."""
         m = self.magnification
         offset = [m * (0.5 - self.x - self.shift_px[0]) - 0.5, m * (0.5 - self.y - self.shift_px[1]) - 0.5]
@@ -144,19 +150,17 @@ _FLAT, _SMOOTH = (
 )
 
 
-def empty_buffers(
-    view: RasterView,
-) -> tuple[Float[np.ndarray, "rows columns 3"], Float[np.ndarray, "rows columns"]]:
+def empty_buffers(view: RasterView) -> tuple[_Colour, Depth]:
     """Black colour buffer, and depth buffer with the depth `FAR_M`."""
     return np.zeros((*view.shape, 3), np.float32), np.full(view.shape, FAR_M, np.float32)
 
 
 def draw(
     view: RasterView,
-    triangles_world: Float[np.ndarray, "faces 3 3"],
+    triangles_world: _Faces,
     colours: Float[np.ndarray, "faces corners 3"],
-    colour_buffer: Float[np.ndarray, "rows columns 3"],
-    depth_buffer: Float[np.ndarray, "rows columns"],
+    colour_buffer: _Colour,
+    depth_buffer: Depth,
 ) -> None:
     """Draw triangles into buffers at the pixels where the triangles are nearer than the buffer's depth.
 
@@ -199,7 +203,7 @@ def draw(
 
 
 def _cut_at_near(
-    points: Float[np.ndarray, "faces 3 3"], colours: Float[np.ndarray, "faces 3 3"]
+    points: _Faces, colours: _Faces
 ) -> tuple[Float[np.ndarray, "kept 3 3"], Float[np.ndarray, "kept 3 3"]]:
     """Cut triangles in camera coordinates at the depth `NEAR_M` (Sutherland and Hodgman, 1974).
 
@@ -256,7 +260,7 @@ class PosedDrone:
         return replace(self, faces_m=self.faces_m[times] * MIRRORED, discs_m=self.discs_m[times] * MIRRORED)
 
 
-def pass_samples(imaging: Imaging) -> Float[np.ndarray, "passes 3"]:
+def pass_samples(imaging: Imaging) -> Samples:
     """(passes, 3), position in the pixel (x, y) and time in the exposure (-1/2 to 1/2) of each pass's samples.
 
     The samples are Hammersley points of bases 2 and 3, shifted so that their mean is the pixel's centre and the middle
@@ -301,9 +305,7 @@ def pose(scene: Scene, drone: int, time_s: Float[np.ndarray, "times"]) -> PosedD
 
 
 def _to_world(
-    triangles_m: Float[np.ndarray, "faces 3 3"],
-    rotation: Float[np.ndarray, "times 3 3"],
-    position_m: Float[np.ndarray, "times 3"],
+    triangles_m: _Faces, rotation: Float[np.ndarray, "times 3 3"], position_m: Float[np.ndarray, "times 3"]
 ) -> Float[np.ndarray, "times faces 3 3"]:
     """(times, faces, 3, 3), triangles transformed from the body frame to the world."""
     corners = triangles_m.reshape(-1, 3) @ rotation.swapaxes(-1, -2) + position_m[:, None]
@@ -335,12 +337,7 @@ def windows(
     return found
 
 
-def average(
-    window: RasterView,
-    posed: list[PosedDrone],
-    samples: Float[np.ndarray, "passes 3"],
-    behind_m: Float[np.ndarray, "rows columns"],
-) -> Float[np.ndarray, "rows columns 4"]:
+def average(window: RasterView, posed: list[PosedDrone], samples: Samples, behind_m: Depth) -> _Seen:
     """(rows, columns, 4), light of drones and visible share of the background, averaged over all passes.
 
     Args:
@@ -355,9 +352,7 @@ def average(
     return total / len(samples)
 
 
-def sample(
-    view: RasterView, posed: list[PosedDrone], index: int, behind_m: Float[np.ndarray, "rows columns"]
-) -> Float[np.ndarray, "rows columns 4"]:
+def sample(view: RasterView, posed: list[PosedDrone], index: int, behind_m: Depth) -> _Seen:
     """(rows, columns, 4), light of drones and visible share of the background at one time of the exposure."""
     light, depth = np.full((*view.shape, 3), -1.0, np.float32), behind_m.copy()
     for drone in posed:

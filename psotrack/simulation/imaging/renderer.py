@@ -50,13 +50,13 @@ from psotrack.simulation.imaging.raster import (
     windows,
 )
 from psotrack.simulation.imaging.scenery import Scenery
+from psotrack.simulation.imaging.sensor import Image
 from psotrack.simulation.labels import Silhouette, lens_silhouettes, silhouettes
 from psotrack.simulation.scenarios import OnboardCamera
 from psotrack.simulation.scene import Scene, image_size_wh
 from psotrack.simulation.world.rooms import room
 
-Image = UInt8[np.ndarray, "height width 3"]
-
+_Part = UInt8[np.ndarray, "_ _ 3"]
 #: Smallest and largest number of samples per pixel, and motion blur per sample, pixels. The smallest number is enough
 #: for anti-aliasing. With 0.6 px per sample, corners of markers were found up to 0.1 px off in the same direction.
 _MIN_SAMPLES, _MAX_SAMPLES, _BLUR_PER_SAMPLE_PX = 4, 24, 0.35
@@ -116,7 +116,7 @@ class CameraRenderer:
         """(height, width, 3), BGR image of the room without drones and without the effects of the sensor."""
         return self.assemble([view.empty_room() for view in self.views])
 
-    def assemble(self, images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> Image:
+    def assemble(self, images: Sequence[_Part]) -> Image:
         """(height, width, 3), the image of the camera, from the images of its views; their sizes may differ."""
         return images[0] if self.lens is None else self.lens.assemble(images)
 

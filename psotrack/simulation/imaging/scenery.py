@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.backdrop import lens_blur
+from psotrack.simulation.imaging.sensor import Image
 from psotrack.simulation.scenarios import Surroundings
-
-Image = UInt8[np.ndarray, "height width 3"]
 
 #: Third number of each thing's random seed.
 _FOR_LAMP, _FOR_SCREEN, _FOR_FOLIAGE, _FOR_PERSON = range(4)

@@ -15,6 +15,8 @@ from jaxtyping import Float, UInt8
 
 from psotrack.simulation.scenarios import Imaging
 
+Image = UInt8[np.ndarray, "height width 3"]
+Light = Float[np.ndarray, "height width 3"]
 GAMMA = 2.2
 #: Number of the first on-board camera's random stream; the stream of a static camera is the camera's index.
 ONBOARD_STREAM = 1000
@@ -43,13 +45,13 @@ _DISPLAY = _display_table()
 _LIGHT = ((np.arange(256) / 255) ** GAMMA).astype(np.float32)
 
 
-def develop(light: Float[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+def develop(light: Light) -> Image:
     """Grey levels of linear light, without noise; light 1 is full scale, and brighter light is clipped."""
     steps = np.clip(light * (_DISPLAY_STEPS - 1) + 0.5, 0, _DISPLAY_STEPS - 1)
     return _DISPLAY[steps.astype(np.uint16)]
 
 
-def undevelop(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
+def undevelop(image: Image) -> Light:
     """Linear light of grey levels."""
     return cv2.LUT(image, _LIGHT)
 
@@ -118,9 +120,7 @@ class Sensor:
         swing = np.sin(2 * np.pi * time_s / self._imaging.exposure_period_s + self._exposure_rad)
         return float(np.exp((low + high) / 2 + (high - low) / 2 * swing))
 
-    def expose(
-        self, image: UInt8[np.ndarray, "height width 3"], frame: int, time_s: float
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def expose(self, image: Image, frame: int, time_s: float) -> Image:
         """Image with the gains at a time, the noise of one frame, and JPEG compression."""
         # A factor g of light is a factor g^(1 / gamma) of grey levels.
         levels = np.arange(256)[:, None] * self.gains(time_s) ** (1 / GAMMA)
@@ -144,8 +144,6 @@ def _noise_tile(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     return np.clip((mixed * (_TILE_UNIT / mixed.std())).round(), -127, 127).astype(np.int8)
 
 
-def _compress(
-    image: UInt8[np.ndarray, "height width 3"], quality: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def _compress(image: Image, quality: int) -> Image:
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))

@@ -16,6 +16,10 @@ from jaxtyping import Bool, Float
 from psotrack.simulation.scenarios import CameraPlace, Vector
 from psotrack.simulation.world import textures
 
+Point = Float[np.ndarray, "3"]
+_Corners = Float[np.ndarray, "4 3"]
+_Boxes = Float[np.ndarray, "boxes 2 3"]
+
 
 class Box(msgspec.Struct, frozen=True, array_like=True):
     """A box with the colour `bgr` (linear reflectance): a piece of furniture or a part of it."""
@@ -98,7 +102,7 @@ class Lamps:
         self,
         points_m: Float[np.ndarray, "*points 3"],
         normals: Float[np.ndarray, "*points 3"],
-        source_m: Float[np.ndarray, "3"],
+        source_m: Point,
     ) -> Float[np.ndarray, "*points"]:
         """Light on faces from one point of a panel: Lambert's law at the panel and at the face, inverse square law."""
         towards = source_m - points_m
@@ -107,9 +111,7 @@ class Lamps:
         received = np.clip((towards * normals).sum(axis=-1), 0, None)
         return self.exposure * received * np.clip(towards[..., 2], 0, None) / distance**2
 
-    def on_faces(
-        self, at_m: Float[np.ndarray, "3"], normals: Float[np.ndarray, "faces 3"]
-    ) -> Float[np.ndarray, "faces"]:
+    def on_faces(self, at_m: Point, normals: Float[np.ndarray, "faces 3"]) -> Float[np.ndarray, "faces"]:
         """Light on the faces of a small object at `at_m`, without shadows."""
         points = np.broadcast_to(at_m, normals.shape)
         direct = sum((self.direct(points, normals, lamp) for lamp in self.centres_m), np.zeros(len(normals)))
@@ -126,10 +128,7 @@ def lamps(centres_m: Float[np.ndarray, "lamps 3"], size_m: tuple[float, float]) 
 
 
 def bake(
-    points_m: Float[np.ndarray, "rows columns 3"],
-    normal: Float[np.ndarray, "3"],
-    panels: Lamps,
-    boxes_m: Float[np.ndarray, "boxes 2 3"],
+    points_m: Float[np.ndarray, "rows columns 3"], normal: Point, panels: Lamps, boxes_m: _Boxes
 ) -> Float[np.ndarray, "rows columns"]:
     """Light at a regular grid of points on one face, with shadows of boxes."""
     raised = points_m + 2e-3 * normal
@@ -147,9 +146,7 @@ def bake(
 
 
 def _blocked(
-    points_m: Float[np.ndarray, "rows columns 3"],
-    source_m: Float[np.ndarray, "3"],
-    boxes_m: Float[np.ndarray, "boxes 2 3"],
+    points_m: Float[np.ndarray, "rows columns 3"], source_m: Point, boxes_m: _Boxes
 ) -> Bool[np.ndarray, "boxes rows columns"]:
     """Whether a box stands between a point and the source (slab test, Kay and Kajiya, 1986)."""
     enter, leave = -np.inf, np.inf
@@ -183,19 +180,19 @@ class Surface:
         texture: (rows, columns, 3), linear BGR light; 1 is white in the middle of the floor.
     """
 
-    corner_m: Float[np.ndarray, "3"]
-    along_m: Float[np.ndarray, "3"]
-    down_m: Float[np.ndarray, "3"]
+    corner_m: Point
+    along_m: Point
+    down_m: Point
     texture: textures.Texture
 
     @property
-    def normal(self) -> Float[np.ndarray, "3"]:
+    def normal(self) -> Point:
         """(3,), unit normal of the side from which the texture does not appear mirrored."""
         n = np.cross(self.down_m, self.along_m)
         return n / np.linalg.norm(n)
 
     @property
-    def corners_m(self) -> Float[np.ndarray, "4 3"]:
+    def corners_m(self) -> _Corners:
         """(4, 3), corners: top left, top right, bottom right, bottom left of the texture."""
         a, b = self.along_m, self.down_m
         return self.corner_m + np.stack([np.zeros(3), a, a + b, b])
@@ -213,7 +210,7 @@ class Room:
 
     surfaces: tuple[Surface, ...]
     panels: Lamps
-    marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
+    marker_corners_m: Mapping[int, _Corners]
 
 
 @functools.lru_cache(maxsize=2)
@@ -250,7 +247,7 @@ def _build(hall: Hall, with_markers: bool, texel_m: float) -> Room:
     for box in hall.boxes:
         surfaces += _sides(box, 2 * texel_m, rng)
     surfaces += [_underside(box, 2 * texel_m, rng) for box in hall.boxes if box.lower_m[2] > 0]
-    marker_corners: dict[int, Float[np.ndarray, "4 3"]] = {}
+    marker_corners: dict[int, _Corners] = {}
     if with_markers:
         for marker, place_m in enumerate(_marker_places(surfaces[2:6], hall), start=1):
             surface, marker_corners[marker] = _marker(marker, hall.marker_size_m, *place_m)
@@ -265,9 +262,7 @@ def _surface(corner: Vector, along: Vector, down: Vector, texture: textures.Text
     return Surface(np.array(corner, float), np.array(along, float), np.array(down, float), texture)
 
 
-def _add_light(
-    surface: Surface, step_m: float, panels: Lamps, boxes_m: Float[np.ndarray, "boxes 2 3"]
-) -> Surface:
+def _add_light(surface: Surface, step_m: float, panels: Lamps, boxes_m: _Boxes) -> Surface:
     """Surface with its texture multiplied by the light; changes the texture in place."""
     columns, rows = (max(2, int(np.linalg.norm(edge) / step_m)) for edge in (surface.along_m, surface.down_m))
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
@@ -280,15 +275,13 @@ def _add_light(
     return Surface(surface.corner_m, surface.along_m, surface.down_m, texture)
 
 
-def _lamp(centre: Float[np.ndarray, "3"], size_m: tuple[float, float]) -> Surface:
+def _lamp(centre: Point, size_m: tuple[float, float]) -> Surface:
     corner = centre - np.array([size_m[0] / 2, size_m[1] / 2, 0.02])
     glow = np.full((8, 16, 3), 3.0, np.float32)
     return Surface(corner, np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0]), glow)
 
 
-def _marker_places(
-    walls: Sequence[Surface], hall: Hall
-) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
+def _marker_places(walls: Sequence[Surface], hall: Hall) -> list[tuple[Point, Point]]:
     """Top left corner of each marker's sheet, and direction of its upper edge; sheets are spread over the walls."""
     sheet_m = hall.marker_size_m * (1 + 2 * _MARKER_MARGIN)
     places = []
@@ -304,9 +297,7 @@ def _marker_places(
     return places
 
 
-def _marker(
-    marker: int, size_m: float, corner: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]
-) -> tuple[Surface, Float[np.ndarray, "4 3"]]:
+def _marker(marker: int, size_m: float, corner: Point, along: Point) -> tuple[Surface, _Corners]:
     # 20 texels per cell, so that cell edges remain texel edges when the texture is halved twice.
     per_cell, cells = 20, 6
     side_px = per_cell * cells
