@@ -22,19 +22,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.evaluation.scores import consistency, gospa, hota, path_errors, rows_apart
 from psotrack.evaluation.tables import DroneEvaluation, ErrorSummary, Evaluation
 from psotrack.support.standard_errors import standard_error
-from psotrack.trajectories import Trajectories
-from psotrack.trajectories.association import (
-    GATE_M,
-    UNASSIGNED,
-    AlignedPair,
-    Distances,
-    align,
-    fixed_identity,
-    fixed_partner_values,
-    identity_switches,
-    paired_values,
-    partners_per_frame,
-)
+from psotrack.trajectories import Trajectories, association
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -81,7 +69,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
         InputError: the reference has no known position, both have no frame in common or frames of other times, or a
             covariance of the estimate is not positive definite.
     """
-    pair = align(traj_est, traj_ref)
+    pair = association.align(traj_est, traj_ref)
     known = pair.truth_known
     beyond = int((pair.frame > traj_est.frame[-1]).sum())
     if beyond > _MUCH * len(pair.frame):
@@ -92,9 +80,9 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
             pair.frame[-1],
             100 * beyond / len(pair.frame),
         )
-    partner = fixed_identity(pair)
+    partner = association.fixed_identity(pair)
     # Each drone with the track that follows it in all frames.
-    followed = {name: fixed_partner_values(getattr(pair, name), partner) for name in _OF_TRACKS}
+    followed = {name: association.fixed_partner_values(getattr(pair, name), partner) for name in _OF_TRACKS}
     residual_m = followed["est_m"] - pair.ref_m
     each_drone = [
         _centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))
@@ -103,11 +91,13 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
         "residual_m": residual_m,
         "centred_m": np.stack([centred_m for _, centred_m in each_drone], axis=1),
     }
-    kept = partners_per_frame(pair.distance_m, keep=True)
-    kept_m = paired_values(pair.distance_m, kept)
-    matched_m = paired_values(pair.distance_m, partners_per_frame(pair.distance_m, keep=False))
+    kept = association.partners_per_frame(pair.distance_m, keep=True)
+    kept_m = association.paired_values(pair.distance_m, kept)
+    matched_m = association.paired_values(
+        pair.distance_m, association.partners_per_frame(pair.distance_m, keep=False)
+    )
     _warn_of_millimetres(pair, np.isfinite(matched_m).any())
-    id_switches = int(identity_switches(kept).sum())
+    id_switches = int(association.identity_switches(kept).sum())
     counted = _counted_estimates(pair, partner)
     num_known, num_estimated = int(known.sum()), int(counted.sum())
     num_matched = int(np.isfinite(kept_m).sum())
@@ -127,7 +117,9 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
             DroneEvaluation(
                 **_errors(pair, followed, slice(drone, drone + 1)),
                 drone=name,
-                estimate=None if partner[drone] == UNASSIGNED else pair.drones_est[partner[drone]],
+                estimate=None
+                if partner[drone] == association.UNASSIGNED
+                else pair.drones_est[partner[drone]],
                 frames=int(known[:, drone].sum()),
                 **vars(each_drone[drone][0]),
             )
@@ -136,10 +128,10 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     )
 
 
-def _warn_of_millimetres(pair: AlignedPair, has_matches: bool) -> None:
+def _warn_of_millimetres(pair: association.AlignedPair, has_matches: bool) -> None:
     """Warn of tracks that are nowhere near the reference, and would be near it if their unit was the millimetre."""
     far_m = np.linalg.norm(pair.ref_m[:, :, None] - pair.est_m[:, None] / 1e3, axis=-1)
-    near = far_m[np.isfinite(far_m)] < GATE_M
+    near = far_m[np.isfinite(far_m)] < association.GATE_M
     # Of all pairs of a track and a drone, one in as many as there are drones is right.
     if not has_matches and near.size and near.mean() > 0.5 / max(pair.distance_m.shape[1:]):
         logger.warning(
@@ -160,9 +152,11 @@ def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFram
     """
     import pandas as pd
 
-    pair = align(traj_est, traj_ref)
-    error_m = np.linalg.norm(fixed_partner_values(pair.est_m, fixed_identity(pair)) - pair.ref_m, axis=-1)
-    switch = identity_switches(partners_per_frame(pair.distance_m, keep=True))
+    pair = association.align(traj_est, traj_ref)
+    error_m = np.linalg.norm(
+        association.fixed_partner_values(pair.est_m, association.fixed_identity(pair)) - pair.ref_m, axis=-1
+    )
+    switch = association.identity_switches(association.partners_per_frame(pair.distance_m, keep=True))
     frame, drone = np.nonzero(pair.truth_known)
     order = np.lexsort((frame, drone))
     frame, drone = frame[order], drone[order]
@@ -178,22 +172,22 @@ def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFram
 
 
 def _counted_estimates(
-    pair: AlignedPair, partner: Int[np.ndarray, "drones"]
+    pair: association.AlignedPair, partner: Int[np.ndarray, "drones"]
 ) -> Bool[np.ndarray, "frames estimates"]:
     """(frames, estimates), the estimates that count as true or false positives.
 
     An estimate does not count where the position of its own drone is unknown, unless it is near another drone.
     """
     unknown = np.zeros(pair.est_m.shape[:2], bool)
-    assigned = partner != UNASSIGNED
+    assigned = partner != association.UNASSIGNED
     unknown[:, partner[assigned]] = ~pair.truth_known[:, assigned]
-    near_a_drone = (pair.distance_m <= GATE_M).any(axis=1)
+    near_a_drone = (pair.distance_m <= association.GATE_M).any(axis=1)
     return np.isfinite(pair.est_m).all(axis=-1) & (near_a_drone | ~unknown)
 
 
-def _identity_true_positives(distance_m: Distances) -> int:
+def _identity_true_positives(distance_m: association.Distances) -> int:
     """Number of frames within the gate under the assignment of whole tracks that has the most such frames."""
-    together = (distance_m <= GATE_M).sum(axis=0)
+    together = (distance_m <= association.GATE_M).sum(axis=0)
     return int(together[linear_sum_assignment(together, maximize=True)].sum())
 
 
@@ -230,7 +224,9 @@ def _centre(
     return _Offset((x, y, z), standard_error_m, "body" if in_body else "world"), centred_m
 
 
-def _errors(pair: AlignedPair, followed: Mapping[str, np.ndarray], drones: slice) -> dict[str, Any]:
+def _errors(
+    pair: association.AlignedPair, followed: Mapping[str, np.ndarray], drones: slice
+) -> dict[str, Any]:
     """Figures that are given for each drone and for all drones together."""
     of_tracks = {name: values[:, drones] for name, values in followed.items()}
     residual_m, centred_m = of_tracks["residual_m"], of_tracks["centred_m"]

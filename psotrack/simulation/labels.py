@@ -16,16 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.recordings import Detections
+from psotrack.simulation.imaging import raster
 from psotrack.simulation.imaging.lens_image import LensImage
-from psotrack.simulation.imaging.raster import (
-    NEAR_M,
-    Pinhole,
-    RasterView,
-    draw,
-    empty_buffers,
-    enclosing_window,
-    full_view,
-)
 from psotrack.simulation.scene import Scene
 from psotrack.simulation.world.drones import disc_fans
 
@@ -45,7 +37,7 @@ class Silhouette:
     """
 
     number: int
-    window: RasterView
+    window: raster.RasterView
     seen: Bool[np.ndarray, "rows columns"]
     whole_px: int
 
@@ -71,7 +63,7 @@ class Silhouette:
 
 
 def silhouettes(
-    scene: Scene, cam: Pinhole, backdrop_depth_m: Float[np.ndarray, "height width"], frame: int
+    scene: Scene, cam: raster.Pinhole, backdrop_depth_m: Float[np.ndarray, "height width"], frame: int
 ) -> list[Silhouette]:
     """Silhouettes of the drones within a camera's image, ordered by number; a silhouette may be fully occluded.
 
@@ -95,7 +87,7 @@ def silhouettes(
 
 def lens_silhouettes(
     scene: Scene,
-    cam: Pinhole,
+    cam: raster.Pinhole,
     lens: LensImage,
     backdrops_depth_m: Sequence[Float[np.ndarray, "_ _"]],
     frame: int,
@@ -125,7 +117,7 @@ def lens_silhouettes(
                 whole_px = max(whole_px, drone.whole_px)
         whole = lens.assemble(masks, cv2.INTER_NEAREST)
         x, y, width, height = cv2.boundingRect(whole)
-        window = RasterView(cam, x, y, width, height)
+        window = raster.RasterView(cam, x, y, width, height)
         seen = whole[window.slices].astype(bool)
         if share > 0:
             # The lens changes the area of the whole drone as it changes the area of the visible part.
@@ -135,23 +127,23 @@ def lens_silhouettes(
 
 
 def _draw_alone(
-    scene: Scene, cam: Pinhole, drone: int, time_s: float
+    scene: Scene, cam: raster.Pinhole, drone: int, time_s: float
 ) -> tuple[Silhouette, Float[np.ndarray, "rows columns"]] | None:
     """The silhouette of a drone that nothing hides, and its depth in the window; None outside the image."""
     shape, flight, at = scene.models[drone], scene.flights[drone], np.array([time_s])
     triangles = np.concatenate([shape.triangles_m, disc_fans(shape)])
     triangles = triangles @ flight.rotation(at)[0].T + flight.position_m(at)[0]
     points = triangles.reshape(-1, 3)
-    window = enclosing_window(full_view(cam), points, _MARGIN_PX)
+    window = raster.enclosing_window(raster.full_view(cam), points, _MARGIN_PX)
     if window is None:
         return None
     beyond = window
-    if (points @ cam.R[2] + cam.t_m[2]).min() > NEAR_M:
+    if (points @ cam.R[2] + cam.t_m[2]).min() > raster.NEAR_M:
         # Parts of the drone outside the image count as hidden.
-        around = RasterView(cam, -cam.width // 2, -cam.height // 2, 2 * cam.width, 2 * cam.height)
-        beyond = enclosing_window(around, points, _MARGIN_PX) or window
-    colour, depth_m = empty_buffers(beyond)
-    draw(beyond, triangles, np.ones((len(triangles), 1, 3)), colour, depth_m)
+        around = raster.RasterView(cam, -cam.width // 2, -cam.height // 2, 2 * cam.width, 2 * cam.height)
+        beyond = raster.enclosing_window(around, points, _MARGIN_PX) or window
+    colour, depth_m = raster.empty_buffers(beyond)
+    raster.draw(beyond, triangles, np.ones((len(triangles), 1, 3)), colour, depth_m)
     covered = colour[..., 0] > 0.5
     part = window.slices_in(beyond)
     alone = Silhouette(drone + 1, window, covered[part], int(np.count_nonzero(covered)))

@@ -22,39 +22,21 @@ from psotrack.evaluation import Evaluation, evaluate
 from psotrack.geometry import in_images, project_visible
 from psotrack.pipeline import changed_settings
 from psotrack.recordings import Recording, read_frames_at, view_in_images
-from psotrack.show.flights import (
-    QUANTITIES,
-    Event,
-    EventKind,
-    FlightTracks,
-    Quantity,
-    RunRecord,
-    TrackedFlight,
-    camera_quality,
-    find_events,
-    quantities,
-)
+from psotrack.show import flights
 from psotrack.show.overlay import draw_drones, drawn_tracks, places_in
-from psotrack.show.reports.scene import (
-    check_page_path,
-    render,
-    row_step,
-    scene_data,
-    shown_times_s,
-    write_page,
-)
+from psotrack.show.reports import scene
 from psotrack.support import FAINT, INK, LINE, STYLE, Report, html_table, no_progress, processors
 from psotrack.trajectories import drones_html
 
 #: Kinds of events that are shown with a picture, in this order of importance.
 _SHOWN = (
-    EventKind.LOST,
-    EventKind.SWITCH,
-    EventKind.MET,
-    EventKind.COASTING,
-    EventKind.FOUND_AGAIN,
-    EventKind.BEGINS,
-    EventKind.LARGEST_ERROR,
+    flights.EventKind.LOST,
+    flights.EventKind.SWITCH,
+    flights.EventKind.MET,
+    flights.EventKind.COASTING,
+    flights.EventKind.FOUND_AGAIN,
+    flights.EventKind.BEGINS,
+    flights.EventKind.LARGEST_ERROR,
 )
 #: Width and height of a picture, pixels.
 _SIZE_WH = (360, 240)
@@ -74,12 +56,12 @@ class Moment:
         picture: JPEG as a data address; empty without a picture.
     """
 
-    event: Event
+    event: flights.Event
     camera: str = ""
     picture: str = ""
 
 
-def choose_events(events: Iterable[Event], most: int) -> list[Event]:
+def choose_events(events: Iterable[flights.Event], most: int) -> list[flights.Event]:
     """The events that matter most, at most a number of them, in the order of their times."""
     shown = [event for event in events if event.kind in _SHOWN]
     ranked = sorted(shown, key=lambda event: _SHOWN.index(event.kind))
@@ -87,8 +69,8 @@ def choose_events(events: Iterable[Event], most: int) -> list[Event]:
 
 
 def take_pictures(
-    events: Sequence[Event],
-    tracks: FlightTracks,
+    events: Sequence[flights.Event],
+    tracks: flights.FlightTracks,
     recording: Recording,
     *,
     jobs: int | None = None,
@@ -175,13 +157,13 @@ _OF_PAGE = {INK: "currentColor", FAINT: "var(--faint)", LINE: "var(--line)"}
 
 
 @rc_context(STYLE)
-def quantity_svg(quantity: Quantity) -> Markup:
+def quantity_svg(quantity: flights.Quantity) -> Markup:
     """A plot of a quantity over time as an SVG element: a line per drone, and gaps where a value is not known.
 
     Matplotlib leaves out points that do not change how a line looks, so that long flights have small plots.
     """
     figure = Figure((9.5, 2.6), facecolor="none")
-    axes = figure.add_subplot(xlabel="time (s)", ylabel=QUANTITIES[quantity.key][0], facecolor="none")
+    axes = figure.add_subplot(xlabel="time (s)", ylabel=flights.QUANTITIES[quantity.key][0], facecolor="none")
     for name, colour, values in zip(quantity.names, quantity.colours, quantity.values.T, strict=True):
         axes.plot(quantity.time_s, values, color=colour, linewidth=1.2, label=name)
     axes.margins(x=0.01)
@@ -228,7 +210,7 @@ class WrittenPage:
 
 def write_flight_report(
     path: Path | str,
-    flight: TrackedFlight,
+    flight: flights.TrackedFlight,
     *,
     pictures: bool = True,
     jobs: int | None = None,
@@ -249,39 +231,43 @@ def write_flight_report(
         InputError: a video cannot be read.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    check_page_path(path, force)
-    time_s = shown_times_s(flight)
-    step, span_s = row_step(len(time_s)), float(time_s[-1] - time_s[0])
+    scene.check_page_path(path, force)
+    time_s = scene.shown_times_s(flight)
+    step, span_s = scene.row_step(len(time_s)), float(time_s[-1] - time_s[0])
     cameras = "" if flight.recording is None else f", {len(flight.recording.rig)} cameras"
     truth = "" if flight.truth is None else ", compared with a reference"
-    text = render(
+    text = scene.render(
         "flight.html",
-        scene_data(flight),
+        scene.scene_data(flight),
         title=flight.name,
         lead=f"{span_s:.1f} s, {len(time_s)} frames{cameras}{truth}",
         sections=[_section(flight, tracks, pictures, jobs, report) for tracks in flight.tracks],
         scene_note="" if step == 1 else f"The 3D view shows every {step}th frame.",
     )
-    write_page(path, text, force=force)
+    scene.write_page(path, text, force=force)
     return WrittenPage(Path(path))
 
 
 def _section(
-    flight: TrackedFlight, tracks: FlightTracks, pictures: bool, jobs: int | None, report: Report
+    flight: flights.TrackedFlight,
+    tracks: flights.FlightTracks,
+    pictures: bool,
+    jobs: int | None,
+    report: Report,
 ) -> dict[str, Any]:
     """What the page shows of one file of tracks; None for a part of which there is nothing to show."""
     truth, recording, record = flight.truth, flight.recording, tracks.record
     evaluation = None
     if truth is not None and flight.errors(tracks) is not None:
         evaluation = evaluate(tracks.trajectories, truth)
-    events = [event for event in find_events(flight) if event.tracks == tracks.label]
+    events = [event for event in flights.find_events(flight) if event.tracks == tracks.label]
     chosen = choose_events(events, MOST_PICTURES)
     moments = [Moment(event) for event in chosen]
     if pictures and recording is not None and recording.videos:
         moments = take_pictures(chosen, tracks, recording, jobs=jobs, report=report)
     cameras = None
     if recording is not None:
-        quality = camera_quality(tracks, recording).to_dict("records")
+        quality = flights.camera_quality(tracks, recording).to_dict("records")
         rows = [[_shown(row[key], form) for _, key, form in _CAMERAS] for row in quality]
         cameras = Markup(html_table([heading for heading, _, _ in _CAMERAS], rows))
     return {
@@ -290,7 +276,10 @@ def _section(
         "drones": Markup(drones_html(tracks.trajectories, tracks.size_m)),
         "cameras": cameras,
         "errors": None if evaluation is None else Markup(evaluation._repr_html_()),
-        "charts": [(QUANTITIES[each.key][1], quantity_svg(each)) for each in quantities(flight, tracks)],
+        "charts": [
+            (flights.QUANTITIES[each.key][1], quantity_svg(each))
+            for each in flights.quantities(flight, tracks)
+        ],
         "moments": moments,
         "more_events": len(events) - len(chosen),
         "run": None if record is None or not record.settings else _run(tracks.path.name, record, flight.name),
@@ -301,7 +290,7 @@ def _shown(value: Any, form: str) -> str:
     return "-" if value is None or value != value else form.format(value)
 
 
-def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[str, str]]:
+def _figures(tracks: flights.FlightTracks, evaluation: Evaluation | None) -> list[tuple[str, str]]:
     """Large numbers, with a word each."""
     flown = tracks.trajectories
     shown = [(f"{flown.num_drones}", "drones"), (f"{flown.seen.mean():.1%}", "of all frames seen")]
@@ -320,7 +309,7 @@ def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[
     return shown
 
 
-def _run(file: str, record: RunRecord, name: str) -> dict[str, Any]:
+def _run(file: str, record: flights.RunRecord, name: str) -> dict[str, Any]:
     """Settings, versions and commands of a run, for the page."""
     lines = "".join(
         f"        {json.dumps(key)}: {value!r},\n" for key, value in changed_settings(record.whole).items()

@@ -15,15 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt16
 
-from psotrack.simulation.imaging.raster import (
-    Depth,
-    Matrix,
-    Pinhole,
-    RasterView,
-    draw,
-    empty_buffers,
-    full_view,
-)
+from psotrack.simulation.imaging import raster
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.rooms import Point, Room, Surface
 
@@ -46,18 +38,18 @@ class Backdrop:
     floor: Bool[np.ndarray, "height width"]
 
 
-def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
+def render(room: Room, cam: raster.Pinhole, imaging: Imaging) -> Backdrop:
     """Draw the empty room for one camera."""
-    number, depth = numbers_and_depth(room.surfaces, full_view(cam))
+    number, depth = numbers_and_depth(room.surfaces, raster.full_view(cam))
     light = lens_blur(render_light(room.surfaces, cam, imaging.antialiasing), imaging.lens_blur_px)
     return Backdrop(light, depth, np.equal(number, 0))
 
 
 def render_light(
-    surfaces: Sequence[Surface], cam: Pinhole, antialiasing: bool
+    surfaces: Sequence[Surface], cam: raster.Pinhole, antialiasing: bool
 ) -> Float[np.ndarray, "height width 3"]:
     """(height, width, 3), linear BGR light of textured surfaces, without the lens's blur."""
-    view = full_view(cam, _MAGNIFICATION if antialiasing else 1)
+    view = raster.full_view(cam, _MAGNIFICATION if antialiasing else 1)
     number, _ = numbers_and_depth(surfaces, view)
     light = np.zeros((*view.shape, 3), np.float32)
     for index, surface in enumerate(surfaces):
@@ -74,14 +66,14 @@ def render_light(
 
 
 def numbers_and_depth(
-    surfaces: Sequence[Surface], view: RasterView
-) -> tuple[Int[np.ndarray, "rows columns"], Depth]:
+    surfaces: Sequence[Surface], view: raster.RasterView
+) -> tuple[Int[np.ndarray, "rows columns"], raster.Depth]:
     """Index of the visible surface at each pixel, -1 without a surface, and its depth along the optical axis."""
     corners = np.stack([surface.corners_m for surface in surfaces])
     triangles = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
     colours = np.repeat(np.arange(1.0, len(corners) + 1), 2)[:, None, None]
-    buffer, depth = empty_buffers(view)
-    draw(view, triangles, np.repeat(colours, 3, axis=-1), buffer, depth)
+    buffer, depth = raster.empty_buffers(view)
+    raster.draw(view, triangles, np.repeat(colours, 3, axis=-1), buffer, depth)
     return buffer[..., 0].round().astype(np.int32) - 1, depth
 
 
@@ -90,7 +82,7 @@ def lens_blur(light: Float[np.ndarray, "*shape"], sigma_px: float) -> Float[np.n
     return cv2.GaussianBlur(light, (0, 0), sigma_px) if sigma_px > 0 else light
 
 
-def texel_to_camera(surface: Surface, cam: Pinhole) -> Matrix:
+def texel_to_camera(surface: Surface, cam: raster.Pinhole) -> raster.Matrix:
     """(3, 3), matrix from a texel (column, row, 1) to the camera coordinates of the texel's point on the surface."""
     rows, columns = surface.texture.shape[:2]
     edges = [cam.R @ edge for edge in (surface.along_m, surface.down_m)]
@@ -158,7 +150,7 @@ LIGHT_UNIT = 16384
 #: BGR light, and the floor's share of the light. OpenCV transforms four channels faster than three.
 Light = UInt16[np.ndarray, "rows columns 4"]
 #: A texture at one resolution, and the matrix from its texels to the texels at full resolution.
-Level = tuple[Light, Matrix]
+Level = tuple[Light, raster.Matrix]
 
 #: Smallest side of a texture's coarsest level, texels.
 _SMALLEST_PX = 8
@@ -202,7 +194,7 @@ class RoomPainter:
         assert tree is not None, "a room has surfaces"
         self._tree = tree
 
-    def paint(self, view: RasterView, image: Light) -> None:
+    def paint(self, view: raster.RasterView, image: Light) -> None:
         """Paint the room in a view, one sample per pixel.
 
         Args:
@@ -219,12 +211,14 @@ class RoomPainter:
                 normal = cam.R @ self._normals[index]
                 self._paint_surface(image, view, index, corners[index], normal / height_m[index])
 
-    def _heights_m(self, view: RasterView) -> Float[np.ndarray, "surfaces"]:
+    def _heights_m(self, view: raster.RasterView) -> Float[np.ndarray, "surfaces"]:
         """(surfaces,), height of the eye over the plane of each surface."""
         eye_m = -view.cam.R.T @ view.cam.t_m
         return ((eye_m - self._corners_m[:, 0]) * self._normals).sum(axis=-1)
 
-    def hiding_depth_m(self, view: RasterView, faces_m: Float[np.ndarray, "faces 3 3"]) -> Depth:
+    def hiding_depth_m(
+        self, view: raster.RasterView, faces_m: Float[np.ndarray, "faces 3 3"]
+    ) -> raster.Depth:
         """(rows, columns), depth of the surfaces that may hide the given faces; `FAR_M` at pixels without a surface."""
         points = faces_m.reshape(-1, 3)
         lower, upper = points.min(axis=0), points.max(axis=0)
@@ -232,12 +226,12 @@ class RoomPainter:
         farthest = np.where(self._normals > 0, lower, upper)
         beyond = ((farthest - self._corners_m[:, 0]) * self._normals).sum(axis=-1) < 0
         hiding = [self.surfaces[index] for index in np.flatnonzero(beyond & (self._heights_m(view) > 0))]
-        return numbers_and_depth(hiding, view)[1] if hiding else empty_buffers(view)[1]
+        return numbers_and_depth(hiding, view)[1] if hiding else raster.empty_buffers(view)[1]
 
     def _paint_surface(
         self,
         image: Light,
-        view: RasterView,
+        view: raster.RasterView,
         index: int,
         corners: Float[np.ndarray, "corners 3"],
         normal_per_height: Point,
@@ -276,7 +270,7 @@ class RoomPainter:
                 nearest = farthest
 
     def _fill(
-        self, image: Light, spans: _Spans, level: UInt16[np.ndarray, "texels_y texels_x 4"], H: Matrix
+        self, image: Light, spans: _Spans, level: UInt16[np.ndarray, "texels_y texels_x 4"], H: raster.Matrix
     ) -> None:
         """Paint a level of a texture into spans; H maps texels to pixels."""
         x1, x2 = int(spans.left.min()), int(spans.right.max()) + 1
@@ -318,7 +312,7 @@ def _levels(surface: Surface, is_floor: bool) -> list[Level]:
 
 
 def may_be_seen(
-    corners: Float[np.ndarray, "surfaces corners 3"], K: Matrix, shape: tuple[int, int]
+    corners: Float[np.ndarray, "surfaces corners 3"], K: raster.Matrix, shape: tuple[int, int]
 ) -> Bool[np.ndarray, "surfaces"]:
     """(surfaces,), False if all corners of a surface are beyond one side of the image or behind the camera."""
     x, y, depth = np.moveaxis(corners @ K.T, -1, 0)

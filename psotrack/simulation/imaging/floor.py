@@ -17,18 +17,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.simulation.imaging import sensor
+from psotrack.simulation.imaging import raster, sensor
 from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur, numbers_and_depth, render_light
-from psotrack.simulation.imaging.raster import (
-    MIRRORED,
-    Pinhole,
-    PosedDrone,
-    Samples,
-    average,
-    full_view,
-    margin_px,
-    windows,
-)
 from psotrack.simulation.imaging.sensor import GAMMA, Image, Light
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.scene import Scene
@@ -58,7 +48,7 @@ class Mirror:
         depth_m: (height, width), depth of the mirrored room along the optical axis.
     """
 
-    cam: Pinhole
+    cam: raster.Pinhole
     share: _Pixels
     light: Light
     depth_m: _Pixels
@@ -72,23 +62,25 @@ class Mirror:
         """(height, width), share of each pixel's light that is not mirrored."""
         return 1 - self.share * self.light.sum(axis=-1) / np.maximum(light.sum(axis=-1), 1e-6)
 
-    def reflect(self, image: Image, posed: list[PosedDrone], samples: Samples, lens_blur_px: float) -> None:
+    def reflect(
+        self, image: Image, posed: list[raster.PosedDrone], samples: raster.Samples, lens_blur_px: float
+    ) -> None:
         """Add the mirror images of drones to an image of the room and its mirror image."""
         passes = [index for index in _PASSES if index < len(samples)]
         samples = samples[passes] - samples[passes].mean(axis=0)
         below = [drone.mirrored(passes) for drone in posed]
         widest_px = max((self._blur_px([drone], lens_blur_px) for drone in below), default=0.0)
-        for window, drones in windows(full_view(self.cam), below, margin_px(widest_px)):
+        for window, drones in raster.windows(raster.full_view(self.cam), below, raster.margin_px(widest_px)):
             share = self.share[window.slices][..., None]
             if not share.any():
                 continue
-            seen = average(window, drones, samples, self.depth_m[window.slices])
+            seen = raster.average(window, drones, samples, self.depth_m[window.slices])
             seen = lens_blur(seen, self._blur_px(drones, lens_blur_px))
             part = image[window.slices]
             change = seen[..., :3] + (seen[..., 3:] - 1) * self.light[window.slices]
             part[...] = sensor.develop(sensor.undevelop(part) + share * change)
 
-    def _blur_px(self, below: list[PosedDrone], lens_blur_px: float) -> float:
+    def _blur_px(self, below: list[raster.PosedDrone], lens_blur_px: float) -> float:
         """Standard deviation of the blur of mirrored drones, which grows with their distance behind the mirror."""
         depth_m = -float(np.mean([drone.faces_m[0, :, :, 2].mean() for drone in below]))
         eye_m = -float((self.cam.R.T @ self.cam.t_m)[2])
@@ -96,7 +88,7 @@ class Mirror:
         return float(np.hypot(roughness_px, lens_blur_px))
 
 
-def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirror:
+def mirror(room: Room, cam: raster.Pinhole, imaging: Imaging, empty: Backdrop) -> Mirror:
     """Mirror image of a room in its floor, in one camera's image.
 
     Args:
@@ -108,13 +100,13 @@ def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirro
     below = [
         replace(
             surface,
-            corner_m=surface.corner_m * MIRRORED,
-            along_m=surface.along_m * MIRRORED,
-            down_m=surface.down_m * MIRRORED,
+            corner_m=surface.corner_m * raster.MIRRORED,
+            along_m=surface.along_m * raster.MIRRORED,
+            down_m=surface.down_m * raster.MIRRORED,
         )
         for surface in room.surfaces[1:]
     ]
-    _, depth = numbers_and_depth(below, full_view(cam))
+    _, depth = numbers_and_depth(below, raster.full_view(cam))
     light = render_light(below, cam, imaging.antialiasing)
     beyond = np.clip(1 - empty.depth_m / depth, 0, 1)
     floor = lens_blur(empty.floor.astype(np.float32), imaging.lens_blur_px)
@@ -127,7 +119,7 @@ def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.n
     return at_normal + (1 - at_normal) * (1 - cosine) ** 5
 
 
-def _cosine_to_floor(cam: Pinhole) -> _Pixels:
+def _cosine_to_floor(cam: raster.Pinhole) -> _Pixels:
     """(height, width), cosine of the angle between the line of sight and the floor's normal; 0 above the horizon."""
     to_world = (cam.R.T @ np.linalg.inv(cam.K)).astype(np.float32)
     x, y = np.arange(cam.width, dtype=np.float32), np.arange(cam.height, dtype=np.float32)[:, None]
@@ -170,7 +162,7 @@ class FloorLight:
         # Matrix from a cell (column, row, 1) to its point on the floor z = 0.
         self._cell_to_world = np.column_stack([along, down, ground.corner_m + 0.5 * (along + down)])
 
-    def to_image(self, cam: Pinhole) -> Float[np.ndarray, "3 3"]:
+    def to_image(self, cam: raster.Pinhole) -> Float[np.ndarray, "3 3"]:
         """(3, 3), matrix from a cell (column, row, 1) to its pixel."""
         return cam.K @ (cam.R @ self._cell_to_world + np.outer(cam.t_m, [0, 0, 1]))
 
@@ -217,7 +209,7 @@ class FloorLight:
 class FloorShadows(FloorLight):
     """Casts the drones' shadows on the floor of one camera's image."""
 
-    def __init__(self, scene: Scene, cam: Pinhole, backdrop: Backdrop, mirror: Mirror | None) -> None:
+    def __init__(self, scene: Scene, cam: raster.Pinhole, backdrop: Backdrop, mirror: Mirror | None) -> None:
         super().__init__(scene)
         x, y, width, height = cv2.boundingRect(backdrop.floor.astype(np.uint8))
         self._window = (slice(y, y + height), slice(x, x + width))

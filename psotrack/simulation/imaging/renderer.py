@@ -25,30 +25,9 @@ from scipy.spatial.transform import Rotation
 from psotrack.geometry import Camera, make_camera
 from psotrack.simulation.flights.motion import quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s
-from psotrack.simulation.imaging import sensor
-from psotrack.simulation.imaging.backdrop import (
-    LIGHT_UNIT,
-    Backdrop,
-    RoomPainter,
-    lens_blur,
-    may_be_seen,
-    render,
-)
+from psotrack.simulation.imaging import backdrop, raster, sensor
 from psotrack.simulation.imaging.floor import FloorLight, FloorShadows, Mirror, mirror
 from psotrack.simulation.imaging.lens_image import LensImage, LensStrips, Strip, lens_image, strips
-from psotrack.simulation.imaging.raster import (
-    Pinhole,
-    PosedDrone,
-    RasterView,
-    average,
-    full_view,
-    margin_px,
-    pass_samples,
-    pinhole,
-    pose,
-    sample,
-    windows,
-)
 from psotrack.simulation.imaging.scenery import Scenery
 from psotrack.simulation.imaging.sensor import Image
 from psotrack.simulation.labels import Silhouette, lens_silhouettes, silhouettes
@@ -66,7 +45,9 @@ _NEAR_SCENERY_M = 1.5
 #: unreasonable effectiveness of quasirandom sequences", 2018).
 _RECURRENCE = np.array([0.7548776662466927, 0.5698402909980532])
 #: Grey level of each light in units of 1 / `LIGHT_UNIT`.
-_DISPLAY = sensor.develop(np.repeat(np.arange(1 << 16)[:, None, None], 3, axis=-1) / LIGHT_UNIT)[:, 0, 0]
+_DISPLAY = sensor.develop(np.repeat(np.arange(1 << 16)[:, None, None], 3, axis=-1) / backdrop.LIGHT_UNIT)[
+    :, 0, 0
+]
 
 
 class CameraRenderer:
@@ -91,7 +72,7 @@ class CameraRenderer:
     def __init__(self, scene: Scene, camera_index: int, stream: int | None = None) -> None:
         imaging, camera = scene.scenario.imaging, scene.rig.cameras[camera_index]
         self.scene = scene
-        self.cam: Pinhole = pinhole(camera)
+        self.cam: raster.Pinhole = raster.pinhole(camera)
         self.size_wh = self.cam.width, self.cam.height
         is_fisheye = camera.fisheye is not None and bool(camera.fisheye)
         self.lens: LensImage | None = lens_image(camera) if is_fisheye or camera.dist.any() else None
@@ -145,21 +126,21 @@ class View:
     def __init__(
         self,
         scene: Scene,
-        cam: Pinhole,
+        cam: raster.Pinhole,
         behind: Scenery,
         shows_px: Float[np.ndarray, "height width 2"] | None = None,
     ) -> None:
         imaging = scene.scenario.imaging
         self.scene = scene
         self.cam = cam
-        self.backdrop: Backdrop = render(scene.room, self.cam, imaging)
+        self.backdrop: backdrop.Backdrop = backdrop.render(scene.room, self.cam, imaging)
         self.mirror: Mirror | None = None
         if imaging.reflections:
             self.mirror = mirror(scene.room, self.cam, imaging, self.backdrop)
             self.backdrop = self.mirror.on(self.backdrop)
         self.shadows = FloorShadows(scene, self.cam, self.backdrop, self.mirror)
         self._clean: Image = sensor.develop(self.backdrop.light)
-        self._samples = pass_samples(imaging)
+        self._samples = raster.pass_samples(imaging)
         self._behind, self._shows_px = behind, shows_px
 
     def clean_frame(self, frame: int) -> Image:
@@ -169,14 +150,16 @@ class View:
         time_s = self.scene.time_s(frame)
         self.shadows.cast(image, time_s)
         during_s = time_s + self._samples[:, 2] * imaging.shutter_s
-        posed = [pose(self.scene, drone, during_s) for drone in range(len(self.scene.flights))]
+        posed = [raster.pose(self.scene, drone, during_s) for drone in range(len(self.scene.flights))]
         if self.mirror is not None:
             self.mirror.reflect(image, posed, self._samples, imaging.lens_blur_px)
         for layer in self._behind.layers(time_s):
             shown = layer if self._shows_px is None else layer.moved(self._shows_px)
             if shown is not None:
                 shown.draw(image)
-        for window, drones in windows(full_view(self.cam), posed, margin_px(imaging.lens_blur_px)):
+        for window, drones in raster.windows(
+            raster.full_view(self.cam), posed, raster.margin_px(imaging.lens_blur_px)
+        ):
             self._draw_drones(image, window, drones)
         return image
 
@@ -184,9 +167,9 @@ class View:
         """(height, width, 3), BGR image of the room without drones."""
         return self._clean.copy()
 
-    def _draw_drones(self, image: Image, window: RasterView, drones: list[PosedDrone]) -> None:
-        seen = average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
-        seen = lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
+    def _draw_drones(self, image: Image, window: raster.RasterView, drones: list[raster.PosedDrone]) -> None:
+        seen = raster.average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
+        seen = backdrop.lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
         part = image[window.slices]
         part[...] = sensor.develop(seen[..., :3] + seen[..., 3:] * sensor.undevelop(part))
 
@@ -213,10 +196,10 @@ class OnboardRenderer:
         self._floor = FloorLight(scene)
         self._painter = _room_painter(scene.scenario.hall, scene.scenario.markers, scene.scale)
 
-    def cam_at(self, time_s: float) -> Pinhole:
+    def cam_at(self, time_s: float) -> raster.Pinhole:
         """Camera at a given time."""
         (centre_m,), (to_world,) = _poses(self.scene, self.drone_index, np.array([time_s]))
-        return Pinhole(to_world.T, -to_world.T @ centre_m, self.K, self.width, self.height)
+        return raster.Pinhole(to_world.T, -to_world.T @ centre_m, self.K, self.width, self.height)
 
     def frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
@@ -234,7 +217,7 @@ class OnboardRenderer:
                 light = self._strip(strip, during_s, (float(drawn[0]), float(drawn[1])))
                 cv2.accumulate(light, total[strip.rows])
         self._cast_shadows(total, len(samples), time_s, row_px)
-        blurred = lens_blur(cv2.cvtColor(total, cv2.COLOR_BGRA2BGR), self._imaging.lens_blur_px)
+        blurred = backdrop.lens_blur(cv2.cvtColor(total, cv2.COLOR_BGRA2BGR), self._imaging.lens_blur_px)
         mean = cv2.addWeighted(blurred, 1 / len(samples), blurred, 0.0, 0.0, dtype=cv2.CV_16U)
         return np.asarray(cv2.LUT(mean, _DISPLAY), np.uint8)
 
@@ -243,9 +226,9 @@ class OnboardRenderer:
     ) -> UInt16[np.ndarray, "rows width 4"]:
         """(rows, width, 4), light of a strip at one time, and the floor's share."""
         others = [i for i in range(len(self.scene.flights)) if i != self.drone_index]
-        posed = [pose(self.scene, drone, np.array([during_s])) for drone in others]
+        posed = [raster.pose(self.scene, drone, np.array([during_s])) for drone in others]
 
-        def draw(view: RasterView) -> UInt16[np.ndarray, "_ _ 4"]:
+        def draw(view: raster.RasterView) -> UInt16[np.ndarray, "_ _ 4"]:
             view = replace(view, shift_px=shift_px)
             light = np.empty((*view.shape, 4), np.uint16)
             self._painter.paint(view, light)
@@ -281,18 +264,21 @@ class OnboardRenderer:
         return float(self.K[0, 0] * (turned_rad + moved_m / _NEAR_SCENERY_M))
 
     def _draw_drones(
-        self, light: UInt16[np.ndarray, "height width 4"], view: RasterView, posed: list[PosedDrone]
+        self,
+        light: UInt16[np.ndarray, "height width 4"],
+        view: raster.RasterView,
+        posed: list[raster.PosedDrone],
     ) -> None:
         # A drone beside the camera reaches behind the camera and has no window, but is not visible.
         visible = [drone for drone in posed if _may_be_seen(drone, view)]
-        for window, drones in windows(view, visible, margin_px(0.0)):
+        for window, drones in raster.windows(view, visible, raster.margin_px(0.0)):
             behind_m = self._painter.hiding_depth_m(
                 window, np.concatenate([drone.faces_m[0] for drone in drones])
             )
-            seen = sample(window, drones, 0, behind_m)
+            seen = raster.sample(window, drones, 0, behind_m)
             part = light[window.slices_in(view)]
             mixed = seen[..., 3:] * part
-            mixed[..., :3] += LIGHT_UNIT * seen[..., :3]
+            mixed[..., :3] += backdrop.LIGHT_UNIT * seen[..., :3]
             part[...] = (mixed + 0.5).astype(np.uint16)
 
     def _cast_shadows(
@@ -303,7 +289,7 @@ class OnboardRenderer:
             return
         lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
 
-        def draw(view: RasterView) -> UInt8[np.ndarray, "_ _"]:
+        def draw(view: raster.RasterView) -> UInt8[np.ndarray, "_ _"]:
             H = np.array([[1, 0, -view.x], [0, 1, -view.y], [0, 0, 1.0]]) @ self._floor.to_image(view.cam)
             return cv2.warpPerspective(lost, H, view.shape[::-1], flags=cv2.INTER_LINEAR)
 
@@ -314,14 +300,14 @@ class OnboardRenderer:
         # Above the horizon, a pixel's line meets the floor behind the camera; the floor's share is 0 at these pixels.
         x, y, width, height = cv2.boundingRect(seen)
         part = total[y : y + height, x : x + width]
-        floor = part[..., 3:] / np.float32(LIGHT_UNIT * num_samples)
+        floor = part[..., 3:] / np.float32(backdrop.LIGHT_UNIT * num_samples)
         part[..., :3] *= 1 - seen[y : y + height, x : x + width, None] / np.float32(255) * floor
 
 
 @functools.lru_cache(maxsize=1)
-def _room_painter(hall: str, with_markers: bool, scale: float) -> RoomPainter:
+def _room_painter(hall: str, with_markers: bool, scale: float) -> backdrop.RoomPainter:
     """Painter of the room, shared by the cameras of all drones."""
-    return RoomPainter(room(hall, with_markers, scale).surfaces)
+    return backdrop.RoomPainter(room(hall, with_markers, scale).surfaces)
 
 
 def camera_record(scene: Scene) -> OnboardCamera:
@@ -380,6 +366,6 @@ def _poses(
     return flight.position_m(time_s) + rotation @ np.array(record.position_m), rotation @ to_body
 
 
-def _may_be_seen(posed: PosedDrone, view: RasterView) -> bool:
+def _may_be_seen(posed: raster.PosedDrone, view: raster.RasterView) -> bool:
     points = np.concatenate([posed.faces_m, posed.discs_m], axis=1).reshape(-1, 3)
-    return bool(may_be_seen((points @ view.cam.R.T + view.cam.t_m)[None], view.K, view.shape)[0])
+    return bool(backdrop.may_be_seen((points @ view.cam.R.T + view.cam.t_m)[None], view.K, view.shape)[0])
