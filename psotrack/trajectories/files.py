@@ -1,6 +1,6 @@
 """Trajectory files: CSV and Parquet tables with one row per frame and drone.
 
-Written files have the columns of `trajectories.ALL_COLUMNS` in this order, those of covariances and orientations only
+Written files have the columns of `columns.ALL_COLUMNS` in this order, those of covariances and orientations only
 if these are known, so that other programs can rely on them. A file to be read needs only `frame`, `drone` and the
 position; rows and columns may have any order, and further columns are ignored.
 """
@@ -30,15 +30,9 @@ from psotrack.support import (
     has_negative_eigenvalue,
     refuse_to_overwrite,
 )
+from psotrack.trajectories.columns import ALL_COLUMNS, PARTS, columns_of, is_known
 from psotrack.trajectories.tracks import Status
-from psotrack.trajectories.trajectories import (
-    ALL_COLUMNS,
-    PARTS,
-    QUANTITIES,
-    Trajectories,
-    columns_of,
-    is_known,
-)
+from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -12,8 +12,9 @@ from pathlib import Path
 
 from psotrack.errors import InputError, OutputError
 from psotrack.support import refuse_to_overwrite
+from psotrack.trajectories.columns import columns_of
 from psotrack.trajectories.files import words_of
-from psotrack.trajectories.trajectories import Trajectories, columns_of
+from psotrack.trajectories.trajectories import Trajectories
 
 
 class RowStream:

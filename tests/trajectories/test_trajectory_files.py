@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from psotrack.trajectories import Status, Trajectories, read_trajectories, write_trajectories
-from psotrack.trajectories.trajectories import ALL_COLUMNS
+from psotrack.trajectories.columns import ALL_COLUMNS
 from psotrack.trajectories.tum import write_tum
 
 SUFFIXES = (".csv", ".parquet")

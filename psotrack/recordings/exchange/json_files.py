@@ -12,7 +12,7 @@ from psotrack.errors import InputError, PsotrackError
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.support import Report, read_json
 from psotrack.trajectories import QUANTITIES, Status, Trajectories, check_cells
-from psotrack.trajectories.trajectories import ALL_COLUMNS, PARTS
+from psotrack.trajectories.columns import ALL_COLUMNS, PARTS
 
 #: Value of the key `format`, and version of the keys' meaning.
 NAME, VERSION = "psotrack tracks", 1

@@ -8,7 +8,6 @@ through the samples of a recorded flight, from motion capture, a tracker or `pso
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -373,10 +372,8 @@ class RecordedFlight(Flight):
     name: str
 
     @cached_property
-    def _splines(self) -> tuple[BSpline, BSpline, BSpline]:
-        """Position, velocity and acceleration over the time of the samples."""
-        position = spline(self.recorded.time_s, self.recorded.position_m)
-        return position, position.derivative(1), position.derivative(2)
+    def _spline(self) -> BSpline:
+        return spline(self.recorded.time_s, self.recorded.position_m)
 
     @cached_property
     def _attitude(self) -> RotationSpline | None:
@@ -389,22 +386,19 @@ class RecordedFlight(Flight):
         """Raise `SettingsError` if a given time of a frame is outside the samples."""
         self._own_time(time_s, _ROUNDING_S)
 
-    def _own_time(
-        self, time_s: Times, beyond_s: float = _BEYOND_S
-    ) -> tuple[Times, Float[np.ndarray, "times 1"]]:
-        """Times within the samples that are nearest to the given times, and the differences to the given times."""
-        samples_s = self.recorded.time_s
-        first_s = self.start_s + float(np.min(time_s, initial=0.0))
-        if first_s < -beyond_s:
+    def _own_time(self, time_s: Times, beyond_s: float = _BEYOND_S) -> Times:
+        """Times of the samples' clock; raises `SettingsError` for a time further outside the samples."""
+        first_s, last_s = self.recorded.time_s[[0, -1]]
+        earliest_s = self.start_s + float(np.min(time_s, initial=0.0))
+        if earliest_s < -beyond_s:
             raise SettingsError(
                 self.name,
-                expected=f"a start_s of at least {self.start_s - first_s:.6g} s",
+                expected=f"a start_s of at least {self.start_s - earliest_s:.6g} s",
                 found=f"{self.start_s:.6g} s",
                 remedy="the drone that follows with a delay begins at an earlier point of the recording",
             )
-        own_s = samples_s[0] + self.start_s + time_s
-        inside_s = np.clip(own_s, samples_s[0], samples_s[-1])
-        fit = np.abs(own_s - inside_s) <= beyond_s
+        own_s = first_s + self.start_s + time_s
+        fit = own_s - last_s <= beyond_s
         if not fit.all():
             raise SettingsError(
                 self.name,
@@ -412,19 +406,15 @@ class RecordedFlight(Flight):
                 found=f"{self.recorded.duration_s:.6g} s",
                 remedy=f"{np.count_nonzero(fit)} of the {len(fit)} frames would fit",
             )
-        return inside_s, (own_s - inside_s)[:, None]
+        return own_s
 
     def derivative(self, time_s: Times, order: int) -> Vectors:
-        """(times, 3), by a Taylor series from the nearest time within the samples."""
-        own_s, beyond_s = self._own_time(time_s)
-        terms = (
-            curve(own_s) * beyond_s**power / math.factorial(power)
-            for power, curve in enumerate(self._splines[order:])
-        )
-        return sum(terms, self.offset_m * (order == 0))
+        """(times, 3), of the spline, whose ends are continued for the exposures of the first and last frame."""
+        return self._spline(self._own_time(time_s), order) + self.offset_m * (order == 0)
 
     def rotation(self, time_s: Times) -> Turns:
         """(times, 3, 3), body to world: as recorded, or from the acceleration if no orientations were recorded."""
         if self._attitude is None:
             return super().rotation(time_s)
-        return self._attitude(self._own_time(time_s)[0]).as_matrix()
+        first_s, last_s = self.recorded.time_s[[0, -1]]
+        return self._attitude(np.clip(self._own_time(time_s), first_s, last_s)).as_matrix()

@@ -11,8 +11,9 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 from numpy.linalg import norm
@@ -132,6 +133,8 @@ class Draw:
         size: (harmonics,), changes of the amplitudes.
         period: (harmonics,), changes of the periods.
         points: (points, 3), changes of the waypoints.
+        yaw: change of the mean heading.
+        sway_phase_rad: phase of the change of heading at time 0.
     """
 
     phase: Float[np.ndarray, "harmonics"]
@@ -139,52 +142,30 @@ class Draw:
     size: Float[np.ndarray, "harmonics"]
     period: Float[np.ndarray, "harmonics"]
     points: Float[np.ndarray, "points 3"]
-
-
-@dataclass(frozen=True)
-class Turn:
-    """Random numbers for a heading.
-
-    Attributes:
-        yaw: change of the mean heading, -1 to 1; the scenario's variation multiplies it.
-        sway_phase_rad: phase of the change of heading at time 0.
-    """
-
     yaw: float = 0.0
     sway_phase_rad: float = 0.0
 
 
-Draws = tuple[tuple[Draw, Turn], ...]
-
-
-def zero_draws(scenario: scenarios.Scenario) -> Draws:
-    """Zeros for each drone, which leave the scenario's flights unchanged."""
-    return tuple((_draw([drone], lambda *shape: np.zeros(shape)), Turn()) for drone in scenario.drones)
-
-
-def draws(scenario: scenarios.Scenario, rng: np.random.Generator) -> Draws:
+def draws(scenario: scenarios.Scenario, rng: np.random.Generator) -> list[Draw]:
     """Random numbers for each drone; drones of one group have the same numbers, except for the heading."""
     drawn: dict[str | int, Draw] = {}
     result = []
     for index, drone in enumerate(scenario.drones):
-        members = (
-            [other for other in scenario.drones if other.group == drone.group] if drone.group else [drone]
-        )
         group = drone.group or index
         if group not in drawn:
-            drawn[group] = _draw(members, lambda *shape: rng.uniform(-1, 1, shape))
-        turn = Turn(float(rng.uniform(-1, 1)), float(rng.uniform(0, 2 * np.pi)))
-        result.append((drawn[group], turn))
-    return tuple(result)
+            members = [other for other in scenario.drones if other.group == drone.group]
+            drawn[group] = _draw(members if drone.group else [drone], rng)
+        yaw, phase_rad = float(rng.uniform(-1, 1)), float(rng.uniform(0, 2 * np.pi))
+        result.append(replace(drawn[group], yaw=yaw, sway_phase_rad=phase_rad))
+    return result
 
 
-def _draw(drones: Sequence[scenarios.Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
+def _draw(drones: Sequence[scenarios.Drone], rng: np.random.Generator) -> Draw:
     """Random numbers for drones of one group, enough for the flight with the most harmonics or waypoints."""
     harmonics = max(_num_harmonics(drone.flight) for drone in drones)
-    points = max(
-        len(drone.flight.points_m) if isinstance(drone.flight, scenarios.Waypoints) else 0 for drone in drones
-    )
-    return Draw(uniform(harmonics), uniform(3), uniform(harmonics), uniform(harmonics), uniform(points, 3))
+    points = max(len(getattr(drone.flight, "points_m", ())) for drone in drones)
+    shapes: tuple[Any, ...] = (harmonics, 3, harmonics, harmonics, (points, 3))
+    return Draw(*(rng.uniform(-1, 1, shape) for shape in shapes))
 
 
 def _num_harmonics(record: scenarios.FlightRecord) -> int:
@@ -194,7 +175,9 @@ def _num_harmonics(record: scenarios.FlightRecord) -> int:
     return 1 if isinstance(record, scenarios.Waypoints) else len(_harmonics(record)[1])
 
 
-def make(scenario: scenarios.Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tuple[Flight, ...]:
+def make(
+    scenario: scenarios.Scenario, drawn: Sequence[Draw], recorded: Mapping[int, Flight]
+) -> tuple[Flight, ...]:
     """Make the flight of each drone, changed by its random numbers.
 
     Args:
@@ -207,8 +190,8 @@ def make(scenario: scenarios.Scenario, drawn: Draws, recorded: Mapping[int, Flig
     """
     made: dict[int, Flight] = {}
     for index in flying_order(scenario):
-        drone, (draw, turn) = scenario.drones[index], drawn[index]
-        heading = make_heading(drone, turn, scenario.variation)
+        drone, draw = scenario.drones[index], drawn[index]
+        heading = make_heading(drone, scenario.variation, draw.yaw, draw.sway_phase_rad)
         match drone.flight:
             case scenarios.FlightFromFile():
                 made[index] = recorded[index]
@@ -226,13 +209,15 @@ def make(scenario: scenarios.Scenario, drawn: Draws, recorded: Mapping[int, Flig
     return tuple(made[index] for index in range(len(scenario.drones)))
 
 
-def make_heading(drone: scenarios.Drone, turn: Turn, variation: scenarios.Variation) -> Heading:
-    """Heading of a drone over time, changed by its random numbers."""
+def make_heading(
+    drone: scenarios.Drone, variation: scenarios.Variation, yaw: float = 0.0, sway_phase_rad: float = 0.0
+) -> Heading:
+    """Heading of a drone over time, changed by its random numbers (see `Draw`)."""
     return Heading(
-        float(np.radians(drone.yaw_deg + turn.yaw * variation.yaw_deg)),
+        float(np.radians(drone.yaw_deg + yaw * variation.yaw_deg)),
         float(np.radians(drone.yaw_sway_deg)),
         2 * np.pi / drone.yaw_period_s,
-        turn.sway_phase_rad,
+        sway_phase_rad,
     )
 
 
@@ -385,9 +370,9 @@ def plan(scenario: scenarios.Scenario, seed: int) -> tuple[Flight, ...]:
             return flights
         violated_s = np.union1d(violated_s, found.time_s)
         excesses.append(found)
-    raise _refusal(
-        scenario, excess(make(scenario, zero_draws(scenario), recorded), scenario, time_s), excesses
-    )
+    still = scenarios.Variation(phase_deg=0, centre_m=0, size=0, period=0, yaw_deg=0)
+    flights = make(msgspec.structs.replace(scenario, variation=still), draws(scenario, rng), recorded)
+    raise _refusal(scenario, excess(flights, scenario, time_s), excesses)
 
 
 def _refusal(scenario: scenarios.Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
@@ -405,7 +390,7 @@ def _recorded(scenario: scenarios.Scenario, time_s: Float[np.ndarray, "frames"])
     recorded: dict[int, Flight] = {}
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.flight, scenarios.FlightFromFile):
-            flight = recorded_flight(drone.flight, make_heading(drone, Turn(), scenario.variation))
+            flight = recorded_flight(drone.flight, make_heading(drone, scenario.variation))
             flight.check(time_s)
             recorded[index] = flight
     return recorded
