@@ -39,6 +39,7 @@ from .files import (
     refuse_to_overwrite,
     user_cache,
 )
+from .locks import POLL_S, Locks
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,
@@ -99,11 +100,13 @@ __all__ = [
     "LARGEST",
     "LINE",
     "MODERATE",
+    "POLL_S",
     "POSITION",
     "STYLE",
     "Advance",
     "Column",
     "Device",
+    "Locks",
     "NotNegative",
     "PluginKind",
     "Positive",

@@ -12,13 +12,13 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.support import Report, html_block, html_table, report_of, user_cache
+from psotrack.support import POLL_S, Report, html_block, html_table, report_of, user_cache
 from psotrack.sweeps.cells import Cell, cameras_label, cell_key, cell_name, title
 from psotrack.sweeps.grid_files import Grid, read_grid
 from psotrack.sweeps.grid_files import grid as grid_of
 from psotrack.sweeps.inputs import Inputs, folder_of, provenance, source_of
 from psotrack.sweeps.runner import Cluster, Result, finished_before, run_cell, run_on_cluster, store_failure
-from psotrack.sweeps.store import POLL_S, Store
+from psotrack.sweeps.store import Store
 from psotrack.sweeps.tables import DESCRIBING
 
 

@@ -17,9 +17,8 @@ from psotrack.pipeline import check_detections, detection_files_of, environment,
 from psotrack.recordings import Recording
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import YOLO
-from psotrack.support import PluginKind, digest_file, digest_record, plain, plugin_source, processors
+from psotrack.support import Locks, PluginKind, digest_file, digest_record, plain, plugin_source, processors
 from psotrack.sweeps.cells import Cell, input_digest, perturb
-from psotrack.sweeps.store import Locks
 from psotrack.trajectories import Trajectories, resample
 
 _PACKAGE = Path(__file__).parents[1]

@@ -31,6 +31,7 @@ from psotrack.foreground.silhouettes import compute
 from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
 from psotrack.settings import flatten
 from psotrack.support import (
+    POLL_S,
     Device,
     drop_programs_if_many,
     keep_compiled,
@@ -40,7 +41,7 @@ from psotrack.support import (
 )
 from psotrack.sweeps.cells import Cell, cell_key, cell_name, describe, input_digest, title
 from psotrack.sweeps.inputs import Input, Inputs, provenance, source_of
-from psotrack.sweeps.store import POLL_S, Store
+from psotrack.sweeps.store import Store
 
 if TYPE_CHECKING:
     from distributed import Client

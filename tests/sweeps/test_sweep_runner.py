@@ -23,10 +23,9 @@ from small_sweeps import SETTINGS, all_rows, grid_file, small_sequence, stamps
 
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
-from psotrack.support import register_plugin
+from psotrack.support import Locks, register_plugin
 from psotrack.sweeps import Inputs, Store, SweepOutcome, cell_key, inputs, plan, runner, sweep
 from psotrack.sweeps import grid as grid_of
-from psotrack.sweeps.store import Locks
 
 METHODS = """
 [methods.usual]

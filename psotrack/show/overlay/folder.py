@@ -282,11 +282,10 @@ def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 5, fo
     recording, cameras = _filmed(flight)
     video = _Scene(flight, recording).mosaic(cameras[:most_cameras], _CODECS[0], _PICTURE_WIDTH_PX)
     instant = len(video.time_s) // 2
+    numbers = video.frame[instant].tolist()
     frames = [
-        next(read_frames_at(camera.video, [number]))[1]
-        if (number := int(video.frame[instant, index])) >= 0
-        else None
-        for index, camera in enumerate(video.cameras)
+        next(read_frames_at(camera.video, [number]))[1] if number >= 0 else None
+        for camera, number in zip(video.cameras, numbers, strict=True)
     ]
     _, coded = cv2.imencode(".png", video.image(instant, frames))
     with atomic_write(path) as temporary:
@@ -391,11 +390,9 @@ class _Scene:
         video = self._recording.videos[name]
         size_wh = _even(np.array(video.image_size_wh) * scale)
         time_s = self._recording.exposed[name].time_s[: video.num_frames]
-        frame = np.arange(len(time_s))[:, None]
-        cameras = (self._camera(name, size_wh),)
-        return DrawnVideo(
-            codec.fourcc, video.fps, size_wh, cameras, self._tracks, frame, self._rows_at(time_s), time_s
-        )
+        camera, frame = self._camera(name, size_wh), np.arange(len(time_s))[:, None]
+        shown = self._tracks, frame, self._rows_at(time_s), time_s
+        return DrawnVideo(codec.fourcc, video.fps, size_wh, (camera,), *shown)
 
     def mosaic(self, names: Sequence[str], codec: Codec, width_px: int) -> DrawnVideo:
         """The video of some cameras at the recording's instants, with the map; images keep their aspect ratios."""
