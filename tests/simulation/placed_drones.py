@@ -118,7 +118,7 @@ def hidden_share(frame, empty, least=0.03):
 def hidden_by_drones(scene, index=0, **options):
     """The share of the room's light that black drones hide in frame 0 of a camera, (height, width)."""
     renderer = CameraRenderer(scene, index)
-    return hidden_share(renderer.clean_frame(0), sensor.develop(renderer.backdrop.light), **options)
+    return hidden_share(renderer.clean_frame(0), sensor.develop(renderer.views[0].backdrop.light), **options)
 
 
 def around(pixel, reach):
@@ -143,7 +143,7 @@ def assert_drawn_at(share, corners, *, atol_px, area_rel):
 def number_image(renderer, frame=0):
     """(height, width), number of the visible drone per pixel at the middle of a frame's exposure, from 1 on; else 0."""
     cam, numbers = renderer.cam, np.zeros((renderer.cam.height, renderer.cam.width), np.uint8)
-    for silhouette in silhouettes(renderer.scene, cam, renderer.backdrop.depth_m, frame):
+    for silhouette in silhouettes(renderer.scene, cam, renderer.views[0].backdrop.depth_m, frame):
         numbers[silhouette.window.slices][silhouette.seen] = silhouette.number
     return numbers
 

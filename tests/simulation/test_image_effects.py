@@ -64,7 +64,7 @@ def make_renderer(*placed, index=0, **imaging):
 
 def test_without_effects_pixels_have_the_colour_of_the_room_or_of_a_drone():
     renderer = make_renderer(hovering(cube(0.3), MIDDLE), antialiasing=False)
-    frame, empty = renderer.clean_frame(0), sensor.develop(renderer.backdrop.light)
+    frame, empty = renderer.clean_frame(0), sensor.develop(renderer.views[0].backdrop.light)
     covered = number_image(renderer) > 0
     assert covered.sum() > 300
     # Each pixel is sampled once, at its centre, so it shows either the black body or the room.
@@ -120,15 +120,15 @@ def test_the_floor_mirrors_more_where_it_is_seen_at_a_lower_angle():
         cosine = eye_m[2] / np.linalg.norm(eye_m - floor_m)
         expected = 0.1 + 0.9 * (1 - cosine) ** 5
         # Rounding to the pixel, up to half a pixel, changes the distance by up to one percent here.
-        assert renderer.mirror.share[y, x] == pytest.approx(expected, rel=0.02)
-    assert not renderer.mirror.share[~renderer.backdrop.floor].any()
+        assert renderer.views[0].mirror.share[y, x] == pytest.approx(expected, rel=0.02)
+    assert not renderer.views[0].mirror.share[~renderer.views[0].backdrop.floor].any()
 
 
 def hidden_in_the_mirror(renderer):
     """The share of the mirrored light that the mirror image of a black body hides, (height, width)."""
-    room = sensor.undevelop(sensor.develop(renderer.backdrop.light))
+    room = sensor.undevelop(sensor.develop(renderer.views[0].backdrop.light))
     change = sensor.undevelop(renderer.clean_frame(0)) - room
-    mirrored = renderer.mirror.share * renderer.mirror.light.sum(axis=-1)
+    mirrored = renderer.views[0].mirror.share * renderer.views[0].mirror.light.sum(axis=-1)
     return -change.sum(axis=-1) / np.maximum(mirrored, 1e-3)
 
 
@@ -151,8 +151,8 @@ def test_shadows_dim_only_the_diffuse_light_of_the_floor():
     at_m = np.array([1.0, -0.5, 0.5])
     placed = hovering(cube(0.4), at_m)
     renderer = make_renderer(placed, reflections=0.5, shadows=True)
-    dull = make_renderer(placed, shadows=True).backdrop.light
-    gain = renderer.shadows.floor_gain(0.0)
+    dull = make_renderer(placed, shadows=True).views[0].backdrop.light
+    gain = renderer.views[0].shadows.floor_gain(0.0)
     assert gain.min() < 0.9
     # The darkest point of the floor. The cube and its mirror image, which reach 20 px, do not hide it.
     row, column = np.unravel_index(gain.argmin(), gain.shape)
@@ -161,8 +161,8 @@ def test_shadows_dim_only_the_diffuse_light_of_the_floor():
     for body_m in (at_m, at_m * [1, 1, -1]):
         assert np.linalg.norm(pixel_of(laboratory(), 0, body_m) - pixel) > 22
     x, y = pixel
-    share = renderer.mirror.share[y, x]
-    expected = gain.min() * (1 - share) * dull[y, x] + share * renderer.mirror.light[y, x]
+    share = renderer.views[0].mirror.share[y, x]
+    expected = gain.min() * (1 - share) * dull[y, x] + share * renderer.views[0].mirror.light[y, x]
     found = sensor.undevelop(renderer.clean_frame(0))[y, x]
     # The tolerance covers pixels that are four cells wide and two roundings to 8 bits.
     np.testing.assert_allclose(found, expected, rtol=0.04)
@@ -178,7 +178,7 @@ def test_a_rotor_lets_three_quarters_of_the_light_through():
     of_all_light = direct / (direct.sum() + AMBIENT)
     # Half way between the hub, which is solid, and the rim; the shadows of all lamps overlap there.
     row, column = int((4.0 - y_m) / CELL_M), int((x_m + 0.15 + 5.0) / CELL_M)
-    gain = renderer.shadows.floor_gain(0.0)[row, column]
+    gain = renderer.views[0].shadows.floor_gain(0.0)[row, column]
     assert gain == pytest.approx(np.prod(1 - 0.25 * of_all_light), abs=0.005)
 
 
@@ -187,7 +187,7 @@ def test_shadows_turn_with_their_drone(yaw_rad):
     solid = cube(0.3)
     bar = replace(solid, triangles_m=solid.triangles_m * [2.0, 0.2, 0.2])
     flight = straight_flight((0.4, 0.2, 0.02), heading=Heading(yaw_rad))
-    lost = 1 - make_renderer((bar, flight, BLACK), shadows=True).shadows.floor_gain(0.0)
+    lost = 1 - make_renderer((bar, flight, BLACK), shadows=True).views[0].shadows.floor_gain(0.0)
     assert lost.max() > 0.1
     # Row numbers of the floor's map grow in the direction of -y.
     rows, columns = np.indices(lost.shape)

@@ -160,7 +160,7 @@ def test_masks_and_frames_agree():
         either = np.count_nonzero(changed | inside)
         assert common > 0.8 * either
         # Masks are disjoint, and boxes bound them.
-        for silhouette in silhouettes(red, renderer.cam, renderer.backdrop.depth_m, frame):
+        for silhouette in silhouettes(red, renderer.cam, renderer.views[0].backdrop.depth_m, frame):
             mask = silhouette.mask()
             np.testing.assert_array_equal(mask, numbers == silhouette.number)
             if silhouette.xyxy is not None:

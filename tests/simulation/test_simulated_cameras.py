@@ -58,7 +58,7 @@ def scene():
 def test_markers_are_detected_at_their_projection():
     scene = laboratory(0.6)
     # The image is in linear light, because gamma spreads white over black and moves each corner inwards by 0.2 px.
-    light = CameraRenderer(scene, 0).backdrop.light
+    light = CameraRenderer(scene, 0).views[0].backdrop.light
     found = find_markers(np.clip(250 * light, 0, 255).astype(np.uint8))
     corners_m = scene.room.marker_corners_m
     assert set(found) <= set(corners_m)

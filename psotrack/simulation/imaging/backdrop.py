@@ -57,7 +57,7 @@ def render_light(
         x, y, width, height = cv2.boundingRect(seen)
         if not width:
             continue
-        H = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]]) @ view.K @ texel_to_camera(surface, cam)
+        H = raster.from_corner(x, y) @ view.K @ texel_to_camera(surface, cam)
         window = cv2.warpPerspective(
             surface.texture, H, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
@@ -279,7 +279,7 @@ class RoomPainter:
             self._buffer = np.empty(window.size, np.uint16)
         # The buffer is reused, because allocating memory for each surface takes as long as painting it.
         painted = self._buffer[: window.size].reshape(window.shape)
-        H = np.array([[1, 0, -x1], [0, 1, -spans.y], [0, 0, 1.0]]) @ H
+        H = raster.from_corner(x1, spans.y) @ H
         cv2.warpPerspective(level, H, window.shape[1::-1], dst=painted, flags=cv2.INTER_LINEAR)
         column = np.arange(x1, x2, dtype=np.int16)
         seen = (column >= spans.left[:, None]) & (column <= spans.right[:, None])

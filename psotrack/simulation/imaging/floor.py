@@ -213,7 +213,7 @@ class FloorShadows(FloorLight):
         super().__init__(scene)
         x, y, width, height = cv2.boundingRect(backdrop.floor.astype(np.uint8))
         self._window = (slice(y, y + height), slice(x, x + width))
-        self._H = np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]]) @ self.to_image(cam)
+        self._H = raster.from_corner(x, y) @ self.to_image(cam)
         # Drones above the floor do not block the light that the floor mirrors towards the camera.
         matt = backdrop.floor if mirror is None else backdrop.floor * mirror.share_of_rest(backdrop.light)
         self._matt = (255 * matt[self._window]).round().astype(np.uint8)

@@ -119,6 +119,11 @@ class RasterView:
         return np.array([[m, 0, offset[0]], [0, m, offset[1]], [0, 0, 1.0]]) @ self.cam.K
 
 
+def from_corner(x: int, y: int) -> Matrix:
+    """(3, 3), matrix from the pixels of an image to those of a part of it with the first column x and row y."""
+    return np.array([[1, 0, -x], [0, 1, -y], [0, 0, 1.0]])
+
+
 def full_view(cam: Pinhole, magnification: int = 1) -> RasterView:
     """Window that is the whole image of a camera."""
     return RasterView(cam, 0, 0, cam.width, cam.height, magnification)

@@ -45,9 +45,7 @@ _NEAR_SCENERY_M = 1.5
 #: unreasonable effectiveness of quasirandom sequences", 2018).
 _RECURRENCE = np.array([0.7548776662466927, 0.5698402909980532])
 #: Grey level of each light in units of 1 / `LIGHT_UNIT`.
-_DISPLAY = sensor.develop(np.repeat(np.arange(1 << 16)[:, None, None], 3, axis=-1) / backdrop.LIGHT_UNIT)[
-    :, 0, 0
-]
+_DISPLAY = sensor.develop(np.arange(1 << 16) / backdrop.LIGHT_UNIT)
 
 
 class CameraRenderer:
@@ -64,7 +62,6 @@ class CameraRenderer:
         size_wh: width and height of the images, pixels.
         lens: how the image is put together from several views; None for a lens without distortion.
         views: views without distortion; for a lens without distortion the only view is the image.
-        backdrop, mirror, shadows: parts of the first view.
         scenery: what changes behind the drones.
         sensor: the sensor.
     """
@@ -83,8 +80,6 @@ class CameraRenderer:
         else:
             faces = zip(self.lens.faces, self.lens.shows_px, strict=True)
             self.views = [View(scene, cam, self.scenery, shows_px) for cam, shows_px in faces]
-        self.backdrop, self.mirror = self.views[0].backdrop, self.views[0].mirror
-        self.shadows = self.views[0].shadows
         self.sensor = sensor.Sensor(imaging, scene.seed, stream, shape)
 
     def clean_frame(self, frame: int) -> Image:
@@ -169,9 +164,8 @@ class View:
 
     def _draw_drones(self, image: Image, window: raster.RasterView, drones: list[raster.PosedDrone]) -> None:
         seen = raster.average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
-        seen = backdrop.lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
-        part = image[window.slices]
-        part[...] = sensor.develop(seen[..., :3] + seen[..., 3:] * sensor.undevelop(part))
+        blurred = backdrop.lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
+        sensor.draw_over(image[window.slices], blurred)
 
 
 class OnboardRenderer:
@@ -290,7 +284,7 @@ class OnboardRenderer:
         lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
 
         def draw(view: raster.RasterView) -> UInt8[np.ndarray, "_ _"]:
-            H = np.array([[1, 0, -view.x], [0, 1, -view.y], [0, 0, 1.0]]) @ self._floor.to_image(view.cam)
+            H = raster.from_corner(view.x, view.y) @ self._floor.to_image(view.cam)
             return cv2.warpPerspective(lost, H, view.shape[::-1], flags=cv2.INTER_LINEAR)
 
         seen = np.zeros(total.shape[:2], np.uint8)

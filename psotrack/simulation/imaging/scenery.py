@@ -79,7 +79,7 @@ class Layer:
             return
         seen = self.seen[top:bottom, left:right]
         part = image[self.y + top : self.y + bottom, self.x + left : self.x + right]
-        part[...] = sensor.develop(seen[..., :3] + seen[..., 3:] * sensor.undevelop(part))
+        sensor.draw_over(part, seen)
 
 
 class Scenery:

@@ -45,7 +45,7 @@ _DISPLAY = _display_table()
 _LIGHT = ((np.arange(256) / 255) ** GAMMA).astype(np.float32)
 
 
-def develop(light: Light) -> Image:
+def develop(light: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Grey levels of linear light, without noise; light 1 is full scale, and brighter light is clipped."""
     steps = np.clip(light * (_DISPLAY_STEPS - 1) + 0.5, 0, _DISPLAY_STEPS - 1)
     return _DISPLAY[steps.astype(np.uint16)]
@@ -54,6 +54,11 @@ def develop(light: Light) -> Image:
 def undevelop(image: Image) -> Light:
     """Linear light of grey levels."""
     return cv2.LUT(image, _LIGHT)
+
+
+def draw_over(part: Image, seen: Float[np.ndarray, "height width 4"]) -> None:
+    """Draw over a part of an image, with light and the share of the light from behind that is still seen."""
+    part[...] = develop(seen[..., :3] + seen[..., 3:] * undevelop(part))
 
 
 def flicker_gain(imaging: Imaging, phase_rad: float, time_s: float) -> float:
