@@ -47,7 +47,7 @@ from psotrack.simulation.imaging.renderer import (
     lens,
     onboard_poses,
 )
-from psotrack.simulation.labels import Silhouette, detect
+from psotrack.simulation.labels import detect
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario, SimulationSettings
 from psotrack.simulation.scene import Scene, build
 from psotrack.support import (
@@ -158,22 +158,22 @@ def _draw(work: Work, advance: Advance) -> None:
                     video.write(artist.frame(frame))
                     advance(1)
             if isinstance(artist, CameraRenderer):
-                _write_labels(work, folder, {frame: artist.silhouettes(frame) for frame in frames})
+                _write_labels(work, folder, artist, frames)
 
 
-def _write_labels(work: Work, folder: Path, drones: dict[int, list[Silhouette]]) -> None:
+def _write_labels(work: Work, folder: Path, artist: CameraRenderer, frames: range) -> None:
     """Write the detections of a segment of a static camera, and the mask of each drone; black where it is not seen."""
+    drones = {frame: artist.silhouettes(frame) for frame in frames}
     found = [detect(work.scene, work.stream.index, frame, seen) for frame, seen in drones.items()]
     parts = ([getattr(each, name) for each in found] for name in ("frame", "xyxy", "confidence"))
     write_detections(folder / _BOXES, Detections(*map(np.concatenate, parts)))
     if work.masks:
-        width, height = work.scene.rig.cameras.image_size_wh[work.stream.index].tolist()
+        black = np.zeros(artist.size_wh[::-1], bool)
         with datasets.MaskWriter(folder / _MASKS) as writer:
             for frame, seen in drones.items():
                 masks = {drone.number: drone.mask() for drone in seen}
                 for number in range(1, len(work.scene.flights) + 1):
-                    mask = masks.get(number, np.zeros((height, width), bool))
-                    writer.write(work.stream.name, number, frame, mask)
+                    writer.write(work.stream.name, number, frame, masks.get(number, black))
 
 
 def _join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
