@@ -127,13 +127,8 @@ def draw_board(image: Image, cam: Pinhole, board: PosedBoard) -> Image:
     texture = _texture()
     rows, columns = texture.shape
     # Texel centres have integer coordinates.
-    to_board = np.array(
-        [
-            [1 / _TEXELS_PER_M, 0, 0.5 / _TEXELS_PER_M - _EDGE_M],
-            [0, 1 / _TEXELS_PER_M, 0.5 / _TEXELS_PER_M - _EDGE_M],
-            [0, 0, 1],
-        ]
-    )
+    texel_m, first_m = 1 / _TEXELS_PER_M, 0.5 / _TEXELS_PER_M - _EDGE_M
+    to_board = np.array([[texel_m, 0, first_m], [0, texel_m, first_m], [0, 0, 1]])
     to_camera = cam.R @ np.column_stack([board.axes[:, :2], board.corner_m]) + np.outer(cam.t_m, [0, 0, 1])
     H = cam.K @ to_camera @ to_board
     outline = np.array([[-0.5, -0.5], [columns - 0.5, -0.5], [columns - 0.5, rows - 0.5], [-0.5, rows - 0.5]])

@@ -138,11 +138,8 @@ def step(state: FlightState, sticks: Sticks, dynamics: Dynamics, space: Space, s
         (commanded_m_s - v_m_s) / dynamics.response_s + dynamics.drag_per_s * commanded_m_s, dynamics
     )
     braking, drag = dynamics.braking_per_s, dynamics.drag_per_s * v_m_s
-    push = np.clip(
-        push,
-        braking * (braking * (space.lower_m - x_m) - 2 * v_m_s) + drag,
-        braking * (braking * (space.upper_m - x_m) - 2 * v_m_s) + drag,
-    )
+    ends_m = (space.lower_m, space.upper_m)
+    push = np.clip(push, *(braking * (braking * (end_m - x_m) - 2 * v_m_s) + drag for end_m in ends_m))
     follow = -np.expm1(-step_s / dynamics.lag_s)
     push = state.push_m_s2 + follow * (_limit_thrust(push, dynamics) - state.push_m_s2)
     turn = state.turn_rad_s + follow * (sticks.turn * dynamics.max_turn_rad_s - state.turn_rad_s)
@@ -157,13 +154,8 @@ def _commanded_velocity(sticks: Sticks, yaw_rad: float, dynamics: Dynamics) -> V
     # Forward and left at full deflection together are limited to the speed of one of them.
     level = dynamics.max_speed_m_s / max(1.0, float(np.hypot(sticks.forward, sticks.left)))
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    return np.array(
-        [
-            level * (cos * sticks.forward - sin * sticks.left),
-            level * (sin * sticks.forward + cos * sticks.left),
-            dynamics.max_climb_m_s * sticks.up,
-        ]
-    )
+    x, y = cos * sticks.forward - sin * sticks.left, sin * sticks.forward + cos * sticks.left
+    return np.array([level * x, level * y, dynamics.max_climb_m_s * sticks.up])
 
 
 def _limit_thrust(push_m_s2: Vector, dynamics: Dynamics) -> Vector:

@@ -304,12 +304,14 @@ def excess(flights: tuple[Flight, ...], scenario: scenarios.Scenario, time_s: Ti
     return None
 
 
+#: Of a limit: the number of the first drone, the excess, the limit in words, the values and their unit.
+_Measured = tuple[int, Float[np.ndarray, "drones times"], str, np.ndarray, str]
+
+
 def _measured(
     flights: tuple[Flight, ...], scenario: scenarios.Scenario, time_s: Times
-) -> Iterator[
-    tuple[int, Float[np.ndarray, "drones times"], str, Float[np.ndarray, "drones times *values"], str]
-]:
-    """Yield for each limit the number of the first drone, the excess, the limit in words, the values and their unit."""
+) -> Iterator[_Measured]:
+    """Yield how far the flights exceed each limit."""
     limits = scenario.limits
     position_m = np.stack([flight.position_m(time_s) for flight in flights])
     outside_m = np.maximum(limits.lower_m - position_m, position_m - limits.upper_m).max(axis=-1)

@@ -164,19 +164,8 @@ _FORESHORTENED = 2.0
 _OVERLAP_PX = 1e-6
 
 
-@dataclass(frozen=True)
-class _Spans:
-    """A convex part of an image.
-
-    Attributes:
-        y: first row.
-        left: (rows,), first column of each row.
-        right: (rows,), last column of each row.
-    """
-
-    y: int
-    left: Int[np.ndarray, "rows"]
-    right: Int[np.ndarray, "rows"]
+#: A convex part of an image: the first row, and (rows,) the first and the last column of each row.
+_Spans = tuple[int, Int[np.ndarray, "rows"], Int[np.ndarray, "rows"]]
 
 
 class RoomPainter:
@@ -273,16 +262,17 @@ class RoomPainter:
         self, image: Light, spans: _Spans, level: UInt16[np.ndarray, "texels_y texels_x 4"], H: raster.Matrix
     ) -> None:
         """Paint a level of a texture into spans; H maps texels to pixels."""
-        x1, x2 = int(spans.left.min()), int(spans.right.max()) + 1
-        window = image[spans.y : spans.y + len(spans.left), x1:x2]
+        y, left, right = spans
+        x1, x2 = int(left.min()), int(right.max()) + 1
+        window = image[y : y + len(left), x1:x2]
         if self._buffer.size < window.size:
             self._buffer = np.empty(window.size, np.uint16)
         # The buffer is reused, because allocating memory for each surface takes as long as painting it.
         painted = self._buffer[: window.size].reshape(window.shape)
-        H = raster.from_corner(x1, spans.y) @ H
+        H = raster.from_corner(x1, y) @ H
         cv2.warpPerspective(level, H, window.shape[1::-1], dst=painted, flags=cv2.INTER_LINEAR)
         column = np.arange(x1, x2, dtype=np.int16)
-        seen = (column >= spans.left[:, None]) & (column <= spans.right[:, None])
+        seen = (column >= left[:, None]) & (column <= right[:, None])
         cv2.copyTo(painted, seen.view(np.uint8), window)
 
 
@@ -315,15 +305,10 @@ def may_be_seen(
     corners: Float[np.ndarray, "surfaces corners 3"], K: raster.Matrix, shape: tuple[int, int]
 ) -> Bool[np.ndarray, "surfaces"]:
     """(surfaces,), False if all corners of a surface are beyond one side of the image or behind the camera."""
-    x, y, depth = np.moveaxis(corners @ K.T, -1, 0)
-    rows, columns = shape
-    beyond = [
-        x < -0.5 * depth,
-        y < -0.5 * depth,
-        x > (columns - 0.5) * depth,
-        y > (rows - 0.5) * depth,
-        depth <= 0,
-    ]
+    *places, depth = np.moveaxis(corners @ K.T, -1, 0)
+    beyond = [depth <= 0]
+    for place, side in zip(places, shape[::-1], strict=True):
+        beyond += [place < -0.5 * depth, place > (side - 0.5) * depth]
     return ~np.any([side.all(axis=-1) for side in beyond], axis=0)
 
 
@@ -344,4 +329,4 @@ def _spans(half_planes: Float[np.ndarray, "edges 3"], shape: tuple[int, int]) ->
     if not len(found):
         return None
     part = slice(found[0], found[-1] + 1)
-    return _Spans(int(found[0]), left[part].astype(np.int16), right[part].astype(np.int16))
+    return int(found[0]), left[part].astype(np.int16), right[part].astype(np.int16)

@@ -97,12 +97,8 @@ class RasterView:
 
     def overlaps(self, other: RasterView) -> bool:
         """Whether two windows share pixels."""
-        return (
-            self.x < other.x + other.width
-            and other.x < self.x + self.width
-            and self.y < other.y + other.height
-            and other.y < self.y + self.height
-        )
+        both = self.union(other)
+        return both.width < self.width + other.width and both.height < self.height + other.height
 
     def union(self, other: RasterView) -> RasterView:
         """Smallest window that contains two windows."""

@@ -36,12 +36,7 @@ _FOR_TILE, _FOR_FRAME, _FOR_DRIFT, _FOR_MAINS, _FOR_EXPOSURE, FOR_SCENERY = 1, 2
 _DISPLAY_STEPS = 65536
 
 
-def _display_table() -> UInt8[np.ndarray, "steps"]:
-    light = np.arange(_DISPLAY_STEPS) / (_DISPLAY_STEPS - 1)
-    return (255 * light ** (1 / GAMMA)).round().astype(np.uint8)
-
-
-_DISPLAY = _display_table()
+_DISPLAY = (255 * (np.arange(_DISPLAY_STEPS) / (_DISPLAY_STEPS - 1)) ** (1 / GAMMA)).round().astype(np.uint8)
 _LIGHT = ((np.arange(256) / 255) ** GAMMA).astype(np.float32)
 
 
