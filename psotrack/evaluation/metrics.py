@@ -102,6 +102,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     num_known, num_estimated = int(known.sum()), int(counted.sum())
     num_matched = int(np.isfinite(kept_m).sum())
     misses, false_positives = num_known - num_matched, num_estimated - num_matched
+    tracks = {association.UNASSIGNED: None} | dict(enumerate(pair.drones_est))
     return Evaluation(
         **_errors(pair, followed, slice(None)),
         **vars(hota(pair.distance_m, known, counted)),
@@ -117,9 +118,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
             DroneEvaluation(
                 **_errors(pair, followed, slice(drone, drone + 1)),
                 drone=name,
-                estimate=None
-                if partner[drone] == association.UNASSIGNED
-                else pair.drones_est[partner[drone]],
+                estimate=tracks[partner[drone]],
                 frames=int(known[:, drone].sum()),
                 **vars(each_drone[drone][0]),
             )

@@ -200,20 +200,15 @@ def perturb(
         rngs = [_rng(_EXTRINSICS, perturbation.draw, camera) for camera in index]
         recording = recording.with_rig(_turn_cameras(recording.rig, perturbation.extrinsics_deg, rngs))
     if silhouettes is not None and perturbation.clock_frames:
-        arrays = [
-            _delay(stored, late)
-            for stored, late in zip(
-                _frames_by_camera(silhouettes), delays_frames(perturbation, index), strict=True
-            )
-        ]
-        silhouettes = replace(silhouettes, arrays=tuple(arrays))
+        late = map(_delay, _frames_by_camera(silhouettes), delays_frames(perturbation, index))
+        silhouettes = replace(silhouettes, arrays=tuple(late))
     if silhouettes is not None and perturbation.flipped:
-        rngs = [_rng(_FLIPS, perturbation.draw, camera) for camera in index]
-        arrays = [
-            _flip_pixels(stored, perturbation.flipped, silhouettes.reduction**2, rng)
-            for stored, rng in zip(_frames_by_camera(silhouettes), rngs, strict=True)
+        of_cameras, pixels = _frames_by_camera(silhouettes), silhouettes.reduction**2
+        noisy = [
+            _flip_pixels(stored, perturbation.flipped, pixels, _rng(_FLIPS, perturbation.draw, camera))
+            for stored, camera in zip(of_cameras, index, strict=True)
         ]
-        silhouettes = replace(silhouettes, arrays=tuple(arrays))
+        silhouettes = replace(silhouettes, arrays=tuple(noisy))
     return recording, silhouettes
 
 

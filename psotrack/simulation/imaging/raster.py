@@ -269,18 +269,12 @@ def pass_samples(imaging: Imaging) -> Samples:
     one pass.
     """
     passes = NUM_PASSES if imaging.antialiasing or imaging.shutter_s else 1
-    points = np.array(
-        [(_radical_inverse(i, 2), _radical_inverse(i, 3), (i + 0.5) / passes) for i in range(passes)]
-    )
+    # Imported here, because the import is slow.
+    from scipy.stats import qmc
+
+    during = (np.arange(passes)[:, None] + 0.5) / passes
+    points = np.hstack([qmc.Halton(2, scramble=False).random(passes), during])
     return (points - points.mean(axis=0)) * [imaging.antialiasing, imaging.antialiasing, 1.0]
-
-
-def _radical_inverse(number: int, base: int) -> float:
-    value, weight = 0.0, 1.0 / base
-    while number:
-        value += weight * (number % base)
-        number, weight = number // base, weight / base
-    return value
 
 
 def pose(scene: Scene, drone: int, time_s: Float[np.ndarray, "times"]) -> PosedDrone:
