@@ -47,7 +47,7 @@ class Silhouette:
         return np.count_nonzero(self.seen) / self.whole_px if self.whole_px else 0.0
 
     @property
-    def xyxy(self) -> Float[np.ndarray, "4"] | None:
+    def xyxy(self) -> Box | None:
         """(4,), box of the visible part, in the convention of `psotrack.geometry.boxes`; None if nothing is visible."""
         rows, columns = (np.flatnonzero(self.seen.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
@@ -63,7 +63,7 @@ class Silhouette:
 
 
 def silhouettes(
-    scene: Scene, cam: raster.Pinhole, backdrop_depth_m: Float[np.ndarray, "height width"], frame: int
+    scene: Scene, cam: raster.Pinhole, backdrop_depth_m: raster.Depth, frame: int
 ) -> list[Silhouette]:
     """Silhouettes of the drones within a camera's image, ordered by number; a silhouette may be fully occluded.
 
@@ -128,7 +128,7 @@ def lens_silhouettes(
 
 def _draw_alone(
     scene: Scene, cam: raster.Pinhole, drone: int, time_s: float
-) -> tuple[Silhouette, Float[np.ndarray, "rows columns"]] | None:
+) -> tuple[Silhouette, raster.Depth] | None:
     """The silhouette of a drone that nothing hides, and its depth in the window; None outside the image."""
     shape, flight, at = scene.models[drone], scene.flights[drone], np.array([time_s])
     triangles = np.concatenate([shape.triangles_m, disc_fans(shape)])

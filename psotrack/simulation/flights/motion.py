@@ -252,7 +252,7 @@ def _noise_m(time_s: Samples, position_m: Positions) -> float:
     return float(np.median(np.abs(residual_m), axis=0).max()) / 0.6745
 
 
-def _knots_s(time_s: Samples) -> Float[np.ndarray, "knots"]:
+def _knots_s(time_s: Samples) -> Times:
     """(knots,), sample times with `_KNOT_S` and `_SAMPLES_PER_KNOT` between them, so that the fit is unique."""
     knots: list[int] = []
     index = 0

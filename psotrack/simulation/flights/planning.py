@@ -343,7 +343,7 @@ NUM_ATTEMPTS = 400
 _STRIDE = 6
 
 
-def frame_times_s(scenario: scenarios.Scenario, num_frames: int) -> Float[np.ndarray, "frames"]:
+def frame_times_s(scenario: scenarios.Scenario, num_frames: int) -> Times:
     """(frames,), time of the middle of each frame's exposure."""
     return np.arange(num_frames) / scenario.fps
 
@@ -387,7 +387,7 @@ def _refusal(scenario: scenarios.Scenario, nominal: Excess | None, varied: list[
     return scenarios.scenario_error(scenario, field, limit, example.found, remedy)
 
 
-def _recorded(scenario: scenarios.Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[int, Flight]:
+def _recorded(scenario: scenarios.Scenario, time_s: Times) -> dict[int, Flight]:
     """Recorded flights by the index of their drone, read once and checked to cover all frames."""
     recorded: dict[int, Flight] = {}
     for index, drone in enumerate(scenario.drones):

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import Camera, has_image, to_pixels, undistort
-from psotrack.simulation.imaging.raster import Pinhole, RasterView, full_view
+from psotrack.simulation.imaging.raster import Matrix, Pinhole, RasterView, full_view
 
 #: Largest distance from the optical axis along x or y, as a tangent, in lenses that are cut from one image: 60 degrees.
 _ONE_FACE = 1.75
@@ -107,8 +107,8 @@ def _nearest_face(
 
 
 def _face(
-    camera: Camera, turn: Float[np.ndarray, "3 3"], normalised: Float[np.ndarray, "rows columns 2"]
-) -> tuple[Pinhole, Float[np.ndarray, "3 3"]]:
+    camera: Camera, turn: Matrix, normalised: Float[np.ndarray, "rows columns 2"]
+) -> tuple[Pinhole, Matrix]:
     """A camera without distortion that shows given normalised coordinates, NaN at other pixels, and inverse K."""
     (x_down, x_along), (y_down, y_along) = (np.gradient(normalised[..., axis]) for axis in range(2))
     area = np.abs(x_along * y_down - x_down * y_along)

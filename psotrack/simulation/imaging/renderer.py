@@ -240,7 +240,7 @@ class OnboardRenderer:
         ends_s = np.array([self._row_time_s(time_s, row) for row in (0.0, self.height - 1.0)])
         return self._motion_px(ends_s) / self.height if self.onboard.line_time_s else 0.0
 
-    def _samples(self, time_s: float) -> Float[np.ndarray, "samples 3"]:
+    def _samples(self, time_s: float) -> raster.Samples:
         """(samples, 3), positions in the pixel (x, y) and times in the exposure (-1/2 to 1/2), with mean 0."""
         during_s = time_s + np.array([-0.5, 0.5]) * self.onboard.shutter_s
         blur_px = self._motion_px(during_s)
@@ -309,7 +309,7 @@ def camera_record(scene: Scene) -> OnboardCamera:
     return scene.scenario.onboard or OnboardCamera()
 
 
-def intrinsics(scene: Scene) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]]:
+def intrinsics(scene: Scene) -> tuple[raster.Matrix, tuple[int, int]]:
     """Intrinsics (3, 3) of the on-board cameras, and width and height of their images, at the scene's scale.
 
     Raises:

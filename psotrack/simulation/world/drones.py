@@ -116,7 +116,7 @@ class DroneModel:
         return float(max(body, reach.max(initial=0.0)))
 
 
-def disc_fans(model: DroneModel) -> Float[np.ndarray, "slices 3 3"]:
+def disc_fans(model: DroneModel) -> Triangles:
     """(slices, 3, 3), rotor discs as triangles around their hubs, body frame."""
     angle = 2 * np.pi * np.arange(_DISC_SIDES + 1) / _DISC_SIDES
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
