@@ -16,7 +16,15 @@ from jaxtyping import Float
 from psotrack.evaluation.path_comparison import PathComparison
 from psotrack.evaluation.tables import drone_label
 from psotrack.support import COLOURS, FAINT, INK, drone_colour, save_figure
-from psotrack.trajectories import Trajectories, association
+from psotrack.trajectories import Trajectories
+from psotrack.trajectories.association import (
+    UNASSIGNED,
+    align,
+    fixed_identity,
+    fixed_partner_values,
+    identity_switches,
+    partners_per_frame,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,16 +59,14 @@ def save_overview(
         InputError: the estimate and the reference do not fit together.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    pair = association.align(traj_est, traj_ref)
-    partner = association.fixed_identity(pair)
-    est_m = association.fixed_partner_values(pair.est_m, partner)
+    pair = align(traj_est, traj_ref)
+    partner = fixed_identity(pair)
+    est_m = fixed_partner_values(pair.est_m, partner)
     error_mm = 1e3 * np.linalg.norm(est_m - pair.ref_m, axis=-1)
-    switches = association.identity_switches(association.partners_per_frame(pair.distance_m, keep=True)).any(
-        axis=1
-    )
+    switches = identity_switches(partners_per_frame(pair.distance_m, keep=True)).any(axis=1)
     lines = []
     for drone, name in enumerate(pair.drones):
-        track = None if partner[drone] == association.UNASSIGNED else pair.drones_est[partner[drone]]
+        track = None if partner[drone] == UNASSIGNED else pair.drones_est[partner[drone]]
         values = {"error (mm)": error_mm[:, drone]}
         lines.append(_Line(drone_label(name, track), drone_colour(drone), est_m[:, drone], values))
     for index in np.setdiff1d(np.arange(len(pair.drones_est)), partner):

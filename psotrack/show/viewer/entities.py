@@ -22,7 +22,18 @@ from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
 from psotrack.inside_out import MarkerMap, read_marker_table
-from psotrack.show import flights
+from psotrack.show.flights import (
+    EventKind,
+    FlightTracks,
+    TrackedFlight,
+    colour_rgb,
+    ellipsoids_90,
+    find_events,
+    intervals,
+    quantities,
+    status_rgb,
+    statuses,
+)
 from psotrack.show.viewer.camera_images import CameraKey
 from psotrack.trajectories import Status
 
@@ -134,24 +145,24 @@ def camera_path(camera: CameraKey) -> str:
     return f"world/{'onboard' if camera.on_drone else 'cameras'}/{part(camera.name)}"
 
 
-def tracks_path(root: str, tracks: flights.FlightTracks) -> str:
+def tracks_path(root: str, tracks: FlightTracks) -> str:
     """Path of what belongs to the tracks of one file."""
     return f"{root}/{part(tracks.group)}" if tracks.group else root
 
 
-def drone_path(root: str, tracks: flights.FlightTracks, drone: str) -> str:
+def drone_path(root: str, tracks: FlightTracks, drone: str) -> str:
     """Path of what belongs to a drone of the tracks of one file."""
     return f"{tracks_path(root, tracks)}/{part(drone)}"
 
 
-def instants(tracks: flights.FlightTracks) -> Instants:
+def instants(tracks: FlightTracks) -> Instants:
     """The instants of tracks."""
     return Instants(tracks.trajectories.frame, tracks.trajectories.time_s)
 
 
-def shown_rgb(tracks: flights.FlightTracks) -> UInt8[np.ndarray, "frames drones 3"]:
+def shown_rgb(tracks: FlightTracks) -> UInt8[np.ndarray, "frames drones 3"]:
     """Colours of drones by their status, which can be read on the dark and on the light theme."""
-    return flights.status_rgb(flights.statuses(tracks.trajectories), tracks.colours, pale=_PALE)
+    return status_rgb(statuses(tracks.trajectories), tracks.colours, pale=_PALE)
 
 
 MARKER_RGB = (255, 90, 200)
@@ -163,7 +174,7 @@ _PATH_OPACITY = 110
 _IMAGE_DISTANCE_M = 1.0
 
 
-def log_world(log: EntityLog, flight: flights.TrackedFlight) -> None:
+def log_world(log: EntityLog, flight: TrackedFlight) -> None:
     """Log what does not move: cameras, bounds and markers."""
     log.static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     recording = flight.recording
@@ -185,7 +196,7 @@ def log_world(log: EntityLog, flight: flights.TrackedFlight) -> None:
         log.static("world/markers", rr.LineStrips3D(outlines_m, colors=[MARKER_RGB], radii=[0.004]))
 
 
-def log_flight(log: EntityLog, flight: flights.TrackedFlight) -> None:
+def log_flight(log: EntityLog, flight: TrackedFlight) -> None:
     """Log the drones of all tracks with their trails and paths, and the reference."""
     for tracks in flight.tracks:
         for drone, name in enumerate(tracks.trajectories.drones):
@@ -203,7 +214,7 @@ def log_flight(log: EntityLog, flight: flights.TrackedFlight) -> None:
         log.static(f"{path}/path", rr.LineStrips3D([position_m[known]], colors=[_TRUTH_RGBA], radii=[0.004]))
 
 
-def log_drones(log: EntityLog, path: str, tracks: flights.FlightTracks, drones: Sequence[int]) -> None:
+def log_drones(log: EntityLog, path: str, tracks: FlightTracks, drones: Sequence[int]) -> None:
     """Log the bodies and ellipsoids of some drones as one entity.
 
     Args:
@@ -213,7 +224,7 @@ def log_drones(log: EntityLog, path: str, tracks: flights.FlightTracks, drones: 
         drones: indices of the drones.
     """
     flown, at = tracks.trajectories, instants(tracks)
-    position_m, status = flown.position_m[:, drones], flights.statuses(flown)[:, drones]
+    position_m, status = flown.position_m[:, drones], statuses(flown)[:, drones]
     rgb, half_m = shown_rgb(tracks)[:, drones], np.broadcast_to(tracks.size_m[drones] / 2, position_m.shape)
     known = np.isfinite(position_m).all(axis=-1)
     names = [tracks.names[drones[each]] for each in np.nonzero(known)[1].tolist()]
@@ -225,7 +236,7 @@ def log_drones(log: EntityLog, path: str, tracks: flights.FlightTracks, drones: 
     log.rows(f"{path}/body", at, rr.Boxes3D, known.sum(axis=1), **shapes, labels=labels)
     if flown.covariance_m2 is None:
         return
-    ellipsoids = flights.ellipsoids_90(flown.covariance_m2[:, drones])
+    ellipsoids = ellipsoids_90(flown.covariance_m2[:, drones])
     # The ellipsoid of a lost drone grows to the size of the room.
     shown = known & np.isfinite(ellipsoids.half_axes_m).all(axis=-1) & (status != Status.LOST)
     turned = Rotation.from_matrix(ellipsoids.rotation[shown]).as_quat()
@@ -257,7 +268,7 @@ def pinhole(K: Float[np.ndarray, "3 3"], image_size_wh: np.ndarray, distance_m: 
     )
 
 
-def _log_path(log: EntityLog, tracks: flights.FlightTracks, drone: int, path: str) -> None:
+def _log_path(log: EntityLog, tracks: FlightTracks, drone: int, path: str) -> None:
     """Log the trail of a drone, from each row before to this one, and the whole path where it is not lost."""
     position_m, rgb = tracks.trajectories.position_m[:, drone], shown_rgb(tracks)[:, drone]
     known = np.isfinite(position_m).all(axis=-1)
@@ -265,19 +276,19 @@ def _log_path(log: EntityLog, tracks: flights.FlightTracks, drone: int, path: st
     strips_m = np.stack([np.roll(position_m, 1, axis=0), position_m], axis=1)[follows]
     lines = {"strips": strips_m, "colors": rgb[follows]}
     log.rows(f"{path}/trail", instants(tracks), rr.LineStrips3D, follows.astype(int), **lines)
-    flown = flights.intervals(known & (flights.statuses(tracks.trajectories)[:, drone] != Status.LOST))
-    own = (*flights.colour_rgb(tracks.colours[drone]), _PATH_OPACITY)
+    flown = intervals(known & (statuses(tracks.trajectories)[:, drone] != Status.LOST))
+    own = (*colour_rgb(tracks.colours[drone]), _PATH_OPACITY)
     whole_m = [position_m[start:stop] for start, stop in flown]
     log.static(f"{path}/path", rr.LineStrips3D(whole_m, colors=[own], radii=[0.006]))
 
 
 #: Events that are shown as warnings.
-_WARNINGS = {flights.EventKind.LOST, flights.EventKind.SWITCH, flights.EventKind.LEFT_OUT}
+_WARNINGS = {EventKind.LOST, EventKind.SWITCH, EventKind.LEFT_OUT}
 #: Colours of tracked, coasting and lost.
 _STATUS_RGB = [(60, 160, 90), (230, 170, 40), (200, 60, 60)]
 
 
-def log_plots(log: EntityLog, flight: flights.TrackedFlight) -> None:
+def log_plots(log: EntityLog, flight: TrackedFlight) -> None:
     """Log the quantities, the status and the events of all tracks."""
     for tracks in flight.tracks:
         _log_quantities(log, flight, tracks)
@@ -286,17 +297,17 @@ def log_plots(log: EntityLog, flight: flights.TrackedFlight) -> None:
         _log_events(log, flight)
 
 
-def _log_quantities(log: EntityLog, flight: flights.TrackedFlight, tracks: flights.FlightTracks) -> None:
+def _log_quantities(log: EntityLog, flight: TrackedFlight, tracks: FlightTracks) -> None:
     """Log a line of each quantity per drone."""
-    for quantity in flights.quantities(flight, tracks):
+    for quantity in quantities(flight, tracks):
         at = Instants(quantity.frame, quantity.time_s)
         for name, colour, values in zip(quantity.names, quantity.colours, quantity.values.T, strict=True):
             path, shown = drone_path(f"plots/{quantity.key}", tracks, name), f"{tracks.group} {name}".strip()
-            log.static(path, rr.SeriesLines(colors=[flights.colour_rgb(colour)], names=[shown], widths=[1.5]))
+            log.static(path, rr.SeriesLines(colors=[colour_rgb(colour)], names=[shown], widths=[1.5]))
             log.rows(path, at, rr.Scalars, scalars=values)
 
 
-def log_status(log: EntityLog, tracks: flights.FlightTracks, before: Mapping[str, int] = {}) -> None:
+def log_status(log: EntityLog, tracks: FlightTracks, before: Mapping[str, int] = {}) -> None:
     """Log each change of a drone's status.
 
     Args:
@@ -306,7 +317,7 @@ def log_status(log: EntityLog, tracks: flights.FlightTracks, before: Mapping[str
     """
     words = [each.label for each in Status]
     for drone, name in enumerate(tracks.trajectories.drones):
-        path, status = drone_path("status", tracks, name), flights.statuses(tracks.trajectories)[:, drone]
+        path, status = drone_path("status", tracks, name), statuses(tracks.trajectories)[:, drone]
         changes = np.flatnonzero(np.diff(status, prepend=before.get(name, -1)))
         if not len(changes):
             continue
@@ -315,10 +326,10 @@ def log_status(log: EntityLog, tracks: flights.FlightTracks, before: Mapping[str
         log.rows(path, at, rr.StateChange, state=[words[each] for each in status[changes]])
 
 
-def _log_events(log: EntityLog, flight: flights.TrackedFlight) -> None:
-    events = flights.find_events(flight)
+def _log_events(log: EntityLog, flight: TrackedFlight) -> None:
+    events = find_events(flight)
     several = len(flight.tracks) > 1
-    for kind in flights.EventKind:
+    for kind in EventKind:
         own = [event for event in events if event.kind == kind]
         texts = [f"{event.tracks}: {event.text}" if several else event.text for event in own]
         at = Instants(

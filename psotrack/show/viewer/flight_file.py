@@ -18,8 +18,17 @@ from psotrack.errors import OutputError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.recordings import Recording, VideoInfo
 from psotrack.show.flights import QUANTITIES, TrackedFlight
-from psotrack.show.viewer import entities
 from psotrack.show.viewer.camera_images import CameraKey, ImagePlan, ImageSource, plan_images
+from psotrack.show.viewer.entities import (
+    FRAME,
+    TIME,
+    EntityLog,
+    camera_path,
+    drone_path,
+    log_flight,
+    log_plots,
+    log_world,
+)
 from psotrack.show.viewer.image_marks import log_images, log_marks
 from psotrack.support import Report, atomic_write, no_progress
 
@@ -43,9 +52,7 @@ def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool =
     if flight.tracks:
         plots = [_plot(key) for key in QUANTITIES if flight.truth is not None or key != "error_mm"]
         left.append(rrb.Horizontal(rrb.Tabs(*plots, active_tab=0), _STATES, column_shares=[3, 2]))
-        columns = rrb.TextLogColumns(
-            timeline_columns=[entities.TIME, entities.FRAME], text_log_columns=["loglevel", "body"]
-        )
+        columns = rrb.TextLogColumns(timeline_columns=[TIME, FRAME], text_log_columns=["loglevel", "body"])
         name = "events: a click on a time jumps there"
         right.append(rrb.TextLogView(origin="/events", name=name, columns=columns))
     halves = [rrb.Vertical(*views, row_shares=[5, 2][: len(views)]) for views in (left, right) if views]
@@ -68,7 +75,7 @@ def _arranged(
         rrb.Horizontal(*columns, column_shares=shares[: len(columns)]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=entities.TIME, **playing),
+        rrb.TimePanel(state="collapsed", timeline=TIME, **playing),
         collapse_panels=False,
         auto_layout=False,
         auto_views=False,
@@ -77,12 +84,12 @@ def _arranged(
 
 def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
     last = rr.VisibleTimeRange(
-        entities.TIME,
+        TIME,
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL_S),
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
     trails: dict[Any, Any] = {
-        f"{entities.drone_path('world/drones', tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
+        f"{drone_path('world/drones', tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
         for tracks in flight.tracks
         for drone in tracks.trajectories.drones
     }
@@ -128,7 +135,7 @@ def _plot(quantity: str) -> rrb.TimeSeriesView:
 def _cameras(recording: Recording, has_onboard: bool) -> rrb.Container:
     def grid(names: Iterable[str], on_drone: bool, title: str) -> rrb.Container:
         keys = [CameraKey(name, on_drone) for name in names]
-        views = [rrb.Spatial2DView(origin=f"/{entities.camera_path(key)}", name=key.name) for key in keys]
+        views = [rrb.Spatial2DView(origin=f"/{camera_path(key)}", name=key.name) for key in keys]
         columns = 2 if len(keys) <= 8 else int(np.ceil(np.sqrt(len(keys))))
         return rrb.Grid(*views, grid_columns=columns, name=title)
 
@@ -235,11 +242,11 @@ def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, r
     try:
         stream.send_recording_name(flight.name)
         videos = _videos(flight, content.onboard)
-        log = entities.EntityLog(stream)
+        log = EntityLog(stream)
         stream.send_blueprint(blueprint_of(flight, has_images=bool(videos), has_onboard=content.onboard))
-        entities.log_world(log, flight)
-        entities.log_flight(log, flight)
-        entities.log_plots(log, flight)
+        log_world(log, flight)
+        log_flight(log, flight)
+        log_plots(log, flight)
         stream.flush()
         most = _max_bytes(flight, content)
         plan = plan_images(videos, _left_bytes(path, most))
@@ -300,7 +307,7 @@ def _sources(
 
 
 def _log_all_images(
-    log: entities.EntityLog,
+    log: EntityLog,
     recording: Recording,
     sources: Mapping[CameraKey, ImageSource],
     num_images: int,

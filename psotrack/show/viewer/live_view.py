@@ -12,8 +12,23 @@ import rerun as rr
 from jaxtyping import Float
 
 from psotrack.recordings import Recording
-from psotrack.show import flights
-from psotrack.show.viewer import entities
+from psotrack.show.flights import (
+    FlightTracks,
+    TrackedFlight,
+    colour_rgb,
+    deviations_mm,
+    flight_of,
+    statuses,
+)
+from psotrack.show.viewer.entities import (
+    EntityLog,
+    Instants,
+    instants,
+    log_drones,
+    log_status,
+    log_world,
+    shown_rgb,
+)
 from psotrack.show.viewer.flight_file import APPLICATION, live_blueprint
 from psotrack.show.viewer.programs import viewer_program
 from psotrack.support import drone_colour, whole_number
@@ -46,7 +61,7 @@ class LiveView:
         self._colours: dict[str, str] = {}
         self._num_lines = 0
         self._ends = contextlib.ExitStack()
-        self._now = entities.Instants(np.zeros(1, int), np.zeros(1))
+        self._now = Instants(np.zeros(1, int), np.zeros(1))
         self.page = ""
 
     def __enter__(self) -> LiveView:
@@ -57,34 +72,34 @@ class LiveView:
             self._stream.connect_grpc(program.address)
             stack.callback(self._close)
             self._stream.send_blueprint(live_blueprint())
-            self._log = entities.EntityLog(self._stream)
-            entities.log_world(self._log, flights.TrackedFlight(self._recording.name, (), self._recording))
+            self._log = EntityLog(self._stream)
+            log_world(self._log, TrackedFlight(self._recording.name, (), self._recording))
             self._ends = stack.pop_all()
         return self
 
     def write(self, rows: Trajectories) -> None:
         """Show the rows of an instant: what belongs together is one entity, because each costs half a millisecond."""
-        (tracks,) = flights.flight_of(rows).tracks
+        (tracks,) = flight_of(rows).tracks
         for name in rows.drones:
             number = whole_number(name)
             number = len(self._colours) if number is None else number
             self._colours.setdefault(name, drone_colour(number))
         tracks = replace(tracks, colours=tuple(self._colours[name] for name in rows.drones))
-        self._now = entities.instants(tracks)
-        entities.log_drones(self._log, "world/drones", tracks, range(len(rows.drones)))
-        entities.log_status(self._log, tracks, self._status)
-        self._status |= dict(zip(rows.drones, flights.statuses(rows)[0].tolist(), strict=True))
+        self._now = instants(tracks)
+        log_drones(self._log, "world/drones", tracks, range(len(rows.drones)))
+        log_status(self._log, tracks, self._status)
+        self._status |= dict(zip(rows.drones, statuses(rows)[0].tolist(), strict=True))
         self._show_trails(tracks)
         self._show_deviations(rows)
 
-    def _show_trails(self, tracks: flights.FlightTracks) -> None:
+    def _show_trails(self, tracks: FlightTracks) -> None:
         rows, trails = tracks.trajectories, self._trails
         position_m = dict(zip(rows.drones, rows.position_m[0].astype(np.float64), strict=True))
         known = [name for name, at_m in position_m.items() if np.isfinite(at_m).all()]
         self._trails = {name: trails.get(name, deque(maxlen=_TRAIL_ROWS)) for name in known}
         for name, trail in self._trails.items():
             trail.append(position_m[name])
-        rgb = entities.shown_rgb(tracks)[0, [rows.drones.index(name) for name in known]]
+        rgb = shown_rgb(tracks)[0, [rows.drones.index(name) for name in known]]
         strips_m = [np.stack(trail) for trail in self._trails.values()]
         self._show("world/drones/trail", rr.LineStrips3D, len(known), strips=strips_m, colors=rgb)
 
@@ -94,10 +109,10 @@ class LiveView:
         path, names = "plots/deviation_mm", list(self._colours)
         if len(names) > self._num_lines:
             self._num_lines = len(names)
-            colours = [flights.colour_rgb(colour) for colour in self._colours.values()]
+            colours = [colour_rgb(colour) for colour in self._colours.values()]
             self._stream.log(path, rr.SeriesLines(colors=colours, names=names, widths=[1.5]), static=True)
         values_mm = np.full(len(names), np.nan)
-        own_mm = np.where(rows.seen[0], flights.deviations_mm(rows.covariance_m2[0]), np.nan)
+        own_mm = np.where(rows.seen[0], deviations_mm(rows.covariance_m2[0]), np.nan)
         values_mm[[names.index(name) for name in rows.drones]] = own_mm
         self._show(path, rr.Scalars, len(names), scalars=values_mm)
 
