@@ -22,7 +22,19 @@ from scipy.spatial.transform import Rotation
 from psotrack.evaluation.scores import consistency, gospa, hota, path_errors, rows_apart
 from psotrack.evaluation.tables import DroneEvaluation, ErrorSummary, Evaluation
 from psotrack.support.standard_errors import standard_error
-from psotrack.trajectories import Trajectories, association
+from psotrack.trajectories import Trajectories
+from psotrack.trajectories.association import (
+    GATE_M,
+    UNASSIGNED,
+    AlignedPair,
+    Distances,
+    align,
+    fixed_identity,
+    fixed_partner_values,
+    identity_switches,
+    paired_values,
+    partners_per_frame,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -69,7 +81,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
         InputError: the reference has no known position, both have no frame in common or frames of other times, or a
             covariance of the estimate is not positive definite.
     """
-    pair = association.align(traj_est, traj_ref)
+    pair = align(traj_est, traj_ref)
     known = pair.truth_known
     beyond = int((pair.frame > traj_est.frame[-1]).sum())
     if beyond > _MUCH * len(pair.frame):
@@ -80,9 +92,9 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
             pair.frame[-1],
             100 * beyond / len(pair.frame),
         )
-    partner = association.fixed_identity(pair)
+    partner = fixed_identity(pair)
     # Each drone with the track that follows it in all frames.
-    followed = {name: association.fixed_partner_values(getattr(pair, name), partner) for name in _OF_TRACKS}
+    followed = {name: fixed_partner_values(getattr(pair, name), partner) for name in _OF_TRACKS}
     residual_m = followed["est_m"] - pair.ref_m
     each_drone = [
         _centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))
@@ -91,18 +103,16 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
         "residual_m": residual_m,
         "centred_m": np.stack([centred_m for _, centred_m in each_drone], axis=1),
     }
-    kept = association.partners_per_frame(pair.distance_m, keep=True)
-    kept_m = association.paired_values(pair.distance_m, kept)
-    matched_m = association.paired_values(
-        pair.distance_m, association.partners_per_frame(pair.distance_m, keep=False)
-    )
+    kept = partners_per_frame(pair.distance_m, keep=True)
+    kept_m = paired_values(pair.distance_m, kept)
+    matched_m = paired_values(pair.distance_m, partners_per_frame(pair.distance_m, keep=False))
     _warn_of_millimetres(pair, np.isfinite(matched_m).any())
-    id_switches = int(association.identity_switches(kept).sum())
+    id_switches = int(identity_switches(kept).sum())
     counted = _counted_estimates(pair, partner)
     num_known, num_estimated = int(known.sum()), int(counted.sum())
     num_matched = int(np.isfinite(kept_m).sum())
     misses, false_positives = num_known - num_matched, num_estimated - num_matched
-    tracks = {association.UNASSIGNED: None} | dict(enumerate(pair.drones_est))
+    tracks = {UNASSIGNED: None} | dict(enumerate(pair.drones_est))
     return Evaluation(
         **_errors(pair, followed, slice(None)),
         **vars(hota(pair.distance_m, known, counted)),
@@ -127,10 +137,10 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     )
 
 
-def _warn_of_millimetres(pair: association.AlignedPair, has_matches: bool) -> None:
+def _warn_of_millimetres(pair: AlignedPair, has_matches: bool) -> None:
     """Warn of tracks that are nowhere near the reference, and would be near it if their unit was the millimetre."""
     far_m = np.linalg.norm(pair.ref_m[:, :, None] - pair.est_m[:, None] / 1e3, axis=-1)
-    near = far_m[np.isfinite(far_m)] < association.GATE_M
+    near = far_m[np.isfinite(far_m)] < GATE_M
     # Of all pairs of a track and a drone, one in as many as there are drones is right.
     if not has_matches and near.size and near.mean() > 0.5 / max(pair.distance_m.shape[1:]):
         logger.warning(
@@ -151,11 +161,9 @@ def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFram
     """
     import pandas as pd
 
-    pair = association.align(traj_est, traj_ref)
-    error_m = np.linalg.norm(
-        association.fixed_partner_values(pair.est_m, association.fixed_identity(pair)) - pair.ref_m, axis=-1
-    )
-    switch = association.identity_switches(association.partners_per_frame(pair.distance_m, keep=True))
+    pair = align(traj_est, traj_ref)
+    error_m = np.linalg.norm(fixed_partner_values(pair.est_m, fixed_identity(pair)) - pair.ref_m, axis=-1)
+    switch = identity_switches(partners_per_frame(pair.distance_m, keep=True))
     frame, drone = np.nonzero(pair.truth_known)
     order = np.lexsort((frame, drone))
     frame, drone = frame[order], drone[order]
@@ -171,22 +179,22 @@ def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFram
 
 
 def _counted_estimates(
-    pair: association.AlignedPair, partner: Int[np.ndarray, "drones"]
+    pair: AlignedPair, partner: Int[np.ndarray, "drones"]
 ) -> Bool[np.ndarray, "frames estimates"]:
     """(frames, estimates), the estimates that count as true or false positives.
 
     An estimate does not count where the position of its own drone is unknown, unless it is near another drone.
     """
     unknown = np.zeros(pair.est_m.shape[:2], bool)
-    assigned = partner != association.UNASSIGNED
+    assigned = partner != UNASSIGNED
     unknown[:, partner[assigned]] = ~pair.truth_known[:, assigned]
-    near_a_drone = (pair.distance_m <= association.GATE_M).any(axis=1)
+    near_a_drone = (pair.distance_m <= GATE_M).any(axis=1)
     return np.isfinite(pair.est_m).all(axis=-1) & (near_a_drone | ~unknown)
 
 
-def _identity_true_positives(distance_m: association.Distances) -> int:
+def _identity_true_positives(distance_m: Distances) -> int:
     """Number of frames within the gate under the assignment of whole tracks that has the most such frames."""
-    together = (distance_m <= association.GATE_M).sum(axis=0)
+    together = (distance_m <= GATE_M).sum(axis=0)
     return int(together[linear_sum_assignment(together, maximize=True)].sum())
 
 
@@ -223,9 +231,7 @@ def _centre(
     return _Offset((x, y, z), standard_error_m, "body" if in_body else "world"), centred_m
 
 
-def _errors(
-    pair: association.AlignedPair, followed: Mapping[str, np.ndarray], drones: slice
-) -> dict[str, Any]:
+def _errors(pair: AlignedPair, followed: Mapping[str, np.ndarray], drones: slice) -> dict[str, Any]:
     """Figures that are given for each drone and for all drones together."""
     of_tracks = {name: values[:, drones] for name, values in followed.items()}
     residual_m, centred_m = of_tracks["residual_m"], of_tracks["centred_m"]

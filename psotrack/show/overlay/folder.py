@@ -27,7 +27,18 @@ from psotrack.recordings import (
     view_in_images,
 )
 from psotrack.show.flights import TrackedFlight, rows_at
-from psotrack.show.overlay import drawing
+from psotrack.show.overlay.drawing import (
+    DrawnTracks,
+    Image,
+    ImagePlaces,
+    MapView,
+    draw_drones,
+    draw_map,
+    drawn_tracks,
+    make_map,
+    places_in,
+    write_text,
+)
 from psotrack.support import (
     Advance,
     Report,
@@ -60,7 +71,7 @@ class DrawnCamera:
     name: str
     video: VideoInfo
     size_wh: tuple[int, int]
-    places: tuple[drawing.ImagePlaces, ...]
+    places: tuple[ImagePlaces, ...]
 
 
 @dataclass(frozen=True)
@@ -83,11 +94,11 @@ class DrawnVideo:
     fps: float
     tile_wh: tuple[int, int]
     cameras: tuple[DrawnCamera, ...]
-    tracks: tuple[drawing.DrawnTracks, ...]
+    tracks: tuple[DrawnTracks, ...]
     frame: Int[np.ndarray, "instants cameras"]
     row: Int[np.ndarray, "instants files"]
     time_s: Float[np.ndarray, " instants"]
-    view: drawing.MapView | None = None
+    view: MapView | None = None
 
     @property
     def columns_lines(self) -> tuple[int, int]:
@@ -96,7 +107,7 @@ class DrawnVideo:
         columns = int(np.ceil(np.sqrt(count)))
         return columns, -(-count // columns)
 
-    def image(self, instant: int, frames: Sequence[_Tile | None]) -> drawing.Image:
+    def image(self, instant: int, frames: Sequence[_Tile | None]) -> Image:
         """What is shown at an instant, of the cameras' frames."""
         (columns, lines), (width, height) = self.columns_lines, self.tile_wh
         image = np.zeros((lines * height, columns * width, 3), np.uint8)
@@ -104,8 +115,8 @@ class DrawnVideo:
         words = f"{self.time_s[instant]:.2f} s"
         tiles = [self._tile(*each, row, trail_rows, words) for each in zip(self.cameras, frames, strict=True)]
         if self.view is not None:
-            tiles.append(drawing.draw_map(self.view, self.tracks, row, trail_rows))
-            drawing.write_text(tiles[-1], words)
+            tiles.append(draw_map(self.view, self.tracks, row, trail_rows))
+            write_text(tiles[-1], words)
         for place, tile in enumerate(tiles):
             line, column = divmod(place, columns)
             top = line * height + (height - tile.shape[0]) // 2
@@ -123,8 +134,8 @@ class DrawnVideo:
         scale = camera.size_wh[0] / camera.video.image_size_wh[0]
         for tracks, places, now in zip(self.tracks, camera.places, row, strict=True):
             if now >= 0:
-                drawing.draw_drones(image, tracks, places, now, scale, trail_rows=trail_rows)
-        drawing.write_text(image, f"{camera.name}  {words}")
+                draw_drones(image, tracks, places, now, scale, trail_rows=trail_rows)
+        write_text(image, f"{camera.name}  {words}")
         return image
 
 
@@ -378,9 +389,7 @@ class _Scene:
 
     def __init__(self, flight: TrackedFlight, recording: Recording) -> None:
         self._flight, self._recording = flight, recording
-        self._tracks: tuple[drawing.DrawnTracks, ...] = tuple(
-            drawing.drawn_tracks(each) for each in flight.tracks
-        )
+        self._tracks: tuple[DrawnTracks, ...] = tuple(drawn_tracks(each) for each in flight.tracks)
         self._views: list[ImageViews] = [
             view_in_images(recording, each.trajectories, each.size_m) for each in flight.tracks
         ]
@@ -413,12 +422,12 @@ class _Scene:
             timeline.frame[:, [timeline.cameras.index(name) for name in names]],
             self._rows_at(timeline.time_s),
             timeline.time_s,
-            drawing.make_map(self._recording.rig, self._tracks, tile_wh),
+            make_map(self._recording.rig, self._tracks, tile_wh),
         )
 
     def _camera(self, name: str, size_wh: tuple[int, int]) -> DrawnCamera:
         index = self._recording.rig.names.index(name)
-        places = tuple(drawing.places_in(views, index) for views in self._views)
+        places = tuple(places_in(views, index) for views in self._views)
         return DrawnCamera(name, self._recording.videos[name], size_wh, places)
 
     def _rows_at(self, time_s: Float[np.ndarray, " times"]) -> Int[np.ndarray, "times files"]:

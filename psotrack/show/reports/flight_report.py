@@ -24,7 +24,14 @@ from psotrack.pipeline import changed_settings
 from psotrack.recordings import Recording, read_frames_at, view_in_images
 from psotrack.show import flights
 from psotrack.show.overlay import draw_drones, drawn_tracks, places_in
-from psotrack.show.reports import scene
+from psotrack.show.reports.scene import (
+    check_page_path,
+    render,
+    row_step,
+    scene_data,
+    shown_times_s,
+    write_page,
+)
 from psotrack.support import FAINT, INK, LINE, STYLE, Report, html_table, no_progress, processors
 from psotrack.trajectories import drones_html
 
@@ -231,20 +238,20 @@ def write_flight_report(
         InputError: a video cannot be read.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    scene.check_page_path(path, force)
-    time_s = scene.shown_times_s(flight)
-    step, span_s = scene.row_step(len(time_s)), float(time_s[-1] - time_s[0])
+    check_page_path(path, force)
+    time_s = shown_times_s(flight)
+    step, span_s = row_step(len(time_s)), float(time_s[-1] - time_s[0])
     cameras = "" if flight.recording is None else f", {len(flight.recording.rig)} cameras"
     truth = "" if flight.truth is None else ", compared with a reference"
-    text = scene.render(
+    text = render(
         "flight.html",
-        scene.scene_data(flight),
+        scene_data(flight),
         title=flight.name,
         lead=f"{span_s:.1f} s, {len(time_s)} frames{cameras}{truth}",
         sections=[_section(flight, tracks, pictures, jobs, report) for tracks in flight.tracks],
         scene_note="" if step == 1 else f"The 3D view shows every {step}th frame.",
     )
-    scene.write_page(path, text, force=force)
+    write_page(path, text, force=force)
     return WrittenPage(Path(path))
 
 

@@ -19,7 +19,6 @@ from jaxtyping import Float
 from numpy.linalg import norm
 
 from psotrack.errors import SettingsError
-from psotrack.simulation import scenarios
 from psotrack.simulation.flights.motion import (
     DelayedFlight,
     Flight,
@@ -30,22 +29,38 @@ from psotrack.simulation.flights.motion import (
     WaypointFlight,
     recorded_flight,
 )
+from psotrack.simulation.scenarios import (
+    Crossing,
+    Drone,
+    FlightFromFile,
+    FlightRecord,
+    FollowingFlight,
+    Formation,
+    Harmonics,
+    NearPass,
+    Orbit,
+    Scenario,
+    Variation,
+    Vector,
+    Waypoints,
+    scenario_error,
+)
 
 #: Largest cosine of the angle between a near pass's side and its swing, which should be perpendicular. The relative
 #: error of the distance is half of the cosine's square, which is negligible.
 _PERPENDICULAR = 1e-6
 
 
-def followed(record: scenarios.FlightRecord) -> tuple[str, int] | None:
+def followed(record: FlightRecord) -> tuple[str, int] | None:
     """Field and number of the drone that a flight is relative to; None for an independent flight."""
-    if isinstance(record, scenarios.Formation | scenarios.FollowingFlight):
+    if isinstance(record, Formation | FollowingFlight):
         return "leader", record.leader
-    if isinstance(record, scenarios.NearPass):
+    if isinstance(record, NearPass):
         return "other", record.other
     return None
 
 
-def flying_order(scenario: scenarios.Scenario) -> tuple[int, ...]:
+def flying_order(scenario: Scenario) -> tuple[int, ...]:
     """Indices of the drones in an order in which each drone comes after the drone that its flight is relative to.
 
     Raises:
@@ -58,24 +73,22 @@ def flying_order(scenario: scenarios.Scenario) -> tuple[int, ...]:
     return tuple(order)
 
 
-def _chain(scenario: scenarios.Scenario, index: int) -> list[int]:
+def _chain(scenario: Scenario, index: int) -> list[int]:
     """Index of a drone, then of the drone that its flight is relative to, and so on along the chain."""
     chain, count = [index], len(scenario.drones)
     while relation := followed(scenario.drones[chain[-1]].flight):
         name, number = relation
         field = f"drones[{chain[-1]}].flight.{name}"
         if number > count:
-            raise scenarios.scenario_error(scenario, field, f"a drone's number, 1 to {count}", number)
+            raise scenario_error(scenario, field, f"a drone's number, 1 to {count}", number)
         chain.append(number - 1)
         if chain[-1] in chain[:-1]:
             loop = " -> ".join(f"{link + 1}" for link in chain)
-            raise scenarios.scenario_error(
-                scenario, field, "relative flights without a cycle", f"drones {loop}"
-            )
+            raise scenario_error(scenario, field, "relative flights without a cycle", f"drones {loop}")
     return chain
 
 
-def check_records(scenario: scenarios.Scenario) -> None:
+def check_records(scenario: Scenario) -> None:
     """Refuse near passes and waypoints that are impossible for every seed.
 
     Raises:
@@ -83,44 +96,40 @@ def check_records(scenario: scenarios.Scenario) -> None:
             between waypoints is above the limit, or two consecutive waypoints are equal. The message names the field.
     """
     for index, drone in enumerate(scenario.drones):
-        if isinstance(drone.flight, scenarios.NearPass):
+        if isinstance(drone.flight, NearPass):
             _check_near_pass(scenario, f"drones[{index}].flight", drone.flight)
-        elif isinstance(drone.flight, scenarios.Waypoints):
+        elif isinstance(drone.flight, Waypoints):
             _check_waypoints(scenario, f"drones[{index}].flight", drone.flight)
 
 
-def _check_near_pass(scenario: scenarios.Scenario, field: str, record: scenarios.NearPass) -> None:
+def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
     for name, vector in (("side", record.side), ("swing_m", record.swing_m)):
         if not np.any(vector):
-            raise scenarios.scenario_error(scenario, f"{field}.{name}", "a direction", "[0, 0, 0]")
+            raise scenario_error(scenario, f"{field}.{name}", "a direction", "[0, 0, 0]")
     side, swing = (np.array(vector) / np.linalg.norm(vector) for vector in (record.side, record.swing_m))
     cosine = float(side @ swing)
     if abs(cosine) > _PERPENDICULAR:
         found = f"one at {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.4g} degrees to it"
         remedy = "otherwise distance_m is not the smallest distance"
-        raise scenarios.scenario_error(
-            scenario, f"{field}.side", "a direction perpendicular to swing_m", found, remedy
-        )
+        raise scenario_error(scenario, f"{field}.side", "a direction perpendicular to swing_m", found, remedy)
 
 
-def _check_waypoints(scenario: scenarios.Scenario, field: str, record: scenarios.Waypoints) -> None:
+def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
     # A fast drone could reach the next waypoint between two frames, where the limits are not checked.
     most_m_s = scenario.limits.max_speed_m_s
     if record.speed_m_s > most_m_s:
         expected = f"at most {most_m_s:g} m/s (limits.max_speed_m_s)"
-        raise scenarios.scenario_error(scenario, f"{field}.speed_m_s", expected, f"{record.speed_m_s:g}")
+        raise scenario_error(scenario, f"{field}.speed_m_s", expected, f"{record.speed_m_s:g}")
     for index, point_m in enumerate(record.points_m):
         if point_m == record.points_m[index - 1]:
             expected = "a point that differs from the previous one (the first point follows the last)"
             found, remedy = f"{list(point_m)} again", "to stand still at a point, set hover_s"
-            raise scenarios.scenario_error(scenario, f"{field}.points_m[{index}]", expected, found, remedy)
+            raise scenario_error(scenario, f"{field}.points_m[{index}]", expected, found, remedy)
 
 
 #: Records of flights that are sums of harmonics.
-HarmonicRecord = (
-    scenarios.Harmonics | scenarios.Orbit | scenarios.Crossing | scenarios.Formation | scenarios.NearPass
-)
-Point = scenarios.Vector | Float[np.ndarray, "3"]
+HarmonicRecord = Harmonics | Orbit | Crossing | Formation | NearPass
+Point = Vector | Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
@@ -146,7 +155,7 @@ class Draw:
     sway_phase_rad: float = 0.0
 
 
-def draws(scenario: scenarios.Scenario, rng: np.random.Generator) -> list[Draw]:
+def draws(scenario: Scenario, rng: np.random.Generator) -> list[Draw]:
     """Random numbers for each drone; drones of one group have the same numbers, except for the heading."""
     drawn: dict[str | int, Draw] = {}
     result = []
@@ -160,7 +169,7 @@ def draws(scenario: scenarios.Scenario, rng: np.random.Generator) -> list[Draw]:
     return result
 
 
-def _draw(drones: Sequence[scenarios.Drone], rng: np.random.Generator) -> Draw:
+def _draw(drones: Sequence[Drone], rng: np.random.Generator) -> Draw:
     """Random numbers for drones of one group, enough for the flight with the most harmonics or waypoints."""
     harmonics = max(_num_harmonics(drone.flight) for drone in drones)
     points = max(len(getattr(drone.flight, "points_m", ())) for drone in drones)
@@ -168,16 +177,14 @@ def _draw(drones: Sequence[scenarios.Drone], rng: np.random.Generator) -> Draw:
     return Draw(*(rng.uniform(-1, 1, shape) for shape in shapes))
 
 
-def _num_harmonics(record: scenarios.FlightRecord) -> int:
-    if isinstance(record, scenarios.FlightFromFile | scenarios.FollowingFlight):
+def _num_harmonics(record: FlightRecord) -> int:
+    if isinstance(record, FlightFromFile | FollowingFlight):
         return 0
     # A flight through waypoints uses one number: the change of its period.
-    return 1 if isinstance(record, scenarios.Waypoints) else len(_harmonics(record)[1])
+    return 1 if isinstance(record, Waypoints) else len(_harmonics(record)[1])
 
 
-def make(
-    scenario: scenarios.Scenario, drawn: Sequence[Draw], recorded: Mapping[int, Flight]
-) -> tuple[Flight, ...]:
+def make(scenario: Scenario, drawn: Sequence[Draw], recorded: Mapping[int, Flight]) -> tuple[Flight, ...]:
     """Make the flight of each drone, changed by its random numbers.
 
     Args:
@@ -193,16 +200,16 @@ def make(
         drone, draw = scenario.drones[index], drawn[index]
         heading = make_heading(drone, scenario.variation, draw.yaw, draw.sway_phase_rad)
         match drone.flight:
-            case scenarios.FlightFromFile():
+            case FlightFromFile():
                 made[index] = recorded[index]
-            case scenarios.FollowingFlight(leader=leader, delay_s=delay_s):
+            case FollowingFlight(leader=leader, delay_s=delay_s):
                 made[index] = DelayedFlight(made[leader - 1], delay_s, heading)
-            case scenarios.Formation(leader=other) | scenarios.NearPass(other=other) as record:
+            case Formation(leader=other) | NearPass(other=other) as record:
                 # Offset and distance that the scenario gives are not varied.
                 unmoved = replace(draw, centre=np.zeros(3))
                 offset = _harmonic_flight(record, unmoved, scenario.variation, heading)
                 made[index] = RelativeFlight(made[other - 1], offset, heading)
-            case scenarios.Waypoints() as record:
+            case Waypoints() as record:
                 made[index] = _waypoint_flight(record, draw, scenario.variation, heading)
             case record:
                 made[index] = _harmonic_flight(record, draw, scenario.variation, heading)
@@ -210,7 +217,7 @@ def make(
 
 
 def make_heading(
-    drone: scenarios.Drone, variation: scenarios.Variation, yaw: float = 0.0, sway_phase_rad: float = 0.0
+    drone: Drone, variation: Variation, yaw: float = 0.0, sway_phase_rad: float = 0.0
 ) -> Heading:
     """Heading of a drone over time, changed by its random numbers (see `Draw`)."""
     return Heading(
@@ -222,7 +229,7 @@ def make_heading(
 
 
 def _harmonic_flight(
-    record: HarmonicRecord, draw: Draw, variation: scenarios.Variation, heading: Heading
+    record: HarmonicRecord, draw: Draw, variation: Variation, heading: Heading
 ) -> HarmonicFlight:
     centre_m, terms = _harmonics(record)
     count = len(terms)
@@ -238,9 +245,7 @@ def _harmonic_flight(
     )
 
 
-def _waypoint_flight(
-    record: scenarios.Waypoints, draw: Draw, variation: scenarios.Variation, heading: Heading
-) -> WaypointFlight:
+def _waypoint_flight(record: Waypoints, draw: Draw, variation: Variation, heading: Heading) -> WaypointFlight:
     points_m = np.array(record.points_m, np.float64)
     points_m = points_m + draw.points[: len(points_m)] * variation.centre_m
     leg_m = np.linalg.norm(np.roll(points_m, -1, axis=0) - points_m, axis=-1)
@@ -251,21 +256,21 @@ def _waypoint_flight(
 def _harmonics(record: HarmonicRecord) -> tuple[Point, list[tuple[Point, float, Point]]]:
     """Centre, and amplitude, period and phases of each term; of a formation or near pass, from the other drone."""
     match record:
-        case scenarios.Harmonics():
+        case Harmonics():
             return record.centre_m, [(one.amplitude_m, one.period_s, one.phase_deg) for one in record.terms]
-        case scenarios.Orbit():
+        case Orbit():
             across = 180.0 if record.clockwise else 0.0
             phases_deg = (record.phase_deg + 90.0, record.phase_deg + across, 0.0)
             about = (*record.radius_m, 0.0), record.period_s, phases_deg
             rise = (0.0, 0.0, record.rise_m), record.rise_period_s, (0.0, 0.0, record.rise_phase_deg)
             return record.centre_m, [about, rise]
-        case scenarios.Crossing():
+        case Crossing():
             start, end = np.array(record.start_m), np.array(record.end_m)
             to_and_fro = (end - start) / 2, record.period_s, (record.phase_deg - 90.0,) * 3
             return (start + end) / 2, [to_and_fro]
-        case scenarios.Formation():
+        case Formation():
             return record.offset_m, []
-        case scenarios.NearPass():
+        case NearPass():
             side = np.array(record.side) / np.linalg.norm(record.side)
             swing = record.swing_m, record.period_s, (record.phase_deg,) * 3
             return side * record.distance_m, [swing]
@@ -287,7 +292,7 @@ class Excess(NamedTuple):
     time_s: float
 
 
-def excess(flights: tuple[Flight, ...], scenario: scenarios.Scenario, time_s: Times) -> Excess | None:
+def excess(flights: tuple[Flight, ...], scenario: Scenario, time_s: Times) -> Excess | None:
     """Find the first limit that the flights violate at any of the given times; None if they keep all limits.
 
     The limits are checked in the order bounds, speed, acceleration, tilt, distance. The distance of two drones in a
@@ -308,9 +313,7 @@ def excess(flights: tuple[Flight, ...], scenario: scenarios.Scenario, time_s: Ti
 _Measured = tuple[int, Float[np.ndarray, "drones times"], str, np.ndarray, str]
 
 
-def _measured(
-    flights: tuple[Flight, ...], scenario: scenarios.Scenario, time_s: Times
-) -> Iterator[_Measured]:
+def _measured(flights: tuple[Flight, ...], scenario: Scenario, time_s: Times) -> Iterator[_Measured]:
     """Yield how far the flights exceed each limit."""
     limits = scenario.limits
     position_m = np.stack([flight.position_m(time_s) for flight in flights])
@@ -328,7 +331,7 @@ def _measured(
     passing = {
         frozenset((index, drone.flight.other - 1))
         for index, drone in enumerate(scenario.drones)
-        if isinstance(drone.flight, scenarios.NearPass)
+        if isinstance(drone.flight, NearPass)
     }
     for one, other in itertools.combinations(range(len(flights)), 2):
         if frozenset((one, other)) not in passing:
@@ -343,12 +346,12 @@ NUM_ATTEMPTS = 400
 _STRIDE = 6
 
 
-def frame_times_s(scenario: scenarios.Scenario, num_frames: int) -> Times:
+def frame_times_s(scenario: Scenario, num_frames: int) -> Times:
     """(frames,), time of the middle of each frame's exposure."""
     return np.arange(num_frames) / scenario.fps
 
 
-def plan(scenario: scenarios.Scenario, seed: int) -> tuple[Flight, ...]:
+def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
     """Flight of each drone, varied by the seed, within the scenario's limits in all frames.
 
     Raises:
@@ -372,26 +375,26 @@ def plan(scenario: scenarios.Scenario, seed: int) -> tuple[Flight, ...]:
             return flights
         violated_s = np.union1d(violated_s, found.time_s)
         excesses.append(found)
-    still = scenarios.Variation(phase_deg=0, centre_m=0, size=0, period=0, yaw_deg=0)
+    still = Variation(phase_deg=0, centre_m=0, size=0, period=0, yaw_deg=0)
     flights = make(msgspec.structs.replace(scenario, variation=still), draws(scenario, rng), recorded)
     raise _refusal(scenario, excess(flights, scenario, time_s), excesses)
 
 
-def _refusal(scenario: scenarios.Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
+def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
     """Error that names the limit that the flights violate without variation, or else the most frequent violation."""
     if nominal:
-        return scenarios.scenario_error(scenario, nominal.field, nominal.limit, nominal.found)
+        return scenario_error(scenario, nominal.field, nominal.limit, nominal.found)
     (field, limit), times = Counter((found.field, found.limit) for found in varied).most_common(1)[0]
     example = next(found for found in varied if (found.field, found.limit) == (field, limit))
     remedy = f"{times} of {len(varied)} variations broke this limit: lower variation, or leave more room"
-    return scenarios.scenario_error(scenario, field, limit, example.found, remedy)
+    return scenario_error(scenario, field, limit, example.found, remedy)
 
 
-def _recorded(scenario: scenarios.Scenario, time_s: Times) -> dict[int, Flight]:
+def _recorded(scenario: Scenario, time_s: Times) -> dict[int, Flight]:
     """Recorded flights by the index of their drone, read once and checked to cover all frames."""
     recorded: dict[int, Flight] = {}
     for index, drone in enumerate(scenario.drones):
-        if isinstance(drone.flight, scenarios.FlightFromFile):
+        if isinstance(drone.flight, FlightFromFile):
             flight = recorded_flight(drone.flight, make_heading(drone, scenario.variation))
             flight.check(time_s)
             recorded[index] = flight
