@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -130,7 +129,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
                 drone=name,
                 estimate=tracks[partner[drone]],
                 frames=int(known[:, drone].sum()),
-                **vars(each_drone[drone][0]),
+                **each_drone[drone][0],
             )
             for drone, name in enumerate(pair.drones)
         ),
@@ -198,24 +197,17 @@ def _identity_true_positives(distance_m: Distances) -> int:
     return int(together[linear_sum_assignment(together, maximize=True)].sum())
 
 
-@dataclass(frozen=True)
-class _Offset:
-    """Mean residual of one drone: its lever arm."""
-
-    offset_m: tuple[float, float, float] | None = None
-    offset_standard_error_m: tuple[float, float, float] | None = None
-    offset_frame: Literal["body", "world"] | None = None
-
-
 def _centre(
-    residual_m: Float[np.ndarray, "frames 3"],
-    orientation_wxyz: Float[np.ndarray, "frames 4"],
-) -> tuple[_Offset, Float[np.ndarray, "frames 3"]]:
-    """Mean residual of one drone, in its body's frame where known, and the residuals without it, in the world."""
+    residual_m: Float[np.ndarray, "frames 3"], orientation_wxyz: Float[np.ndarray, "frames 4"]
+) -> tuple[dict[str, Any], Float[np.ndarray, "frames 3"]]:
+    """Figures of the mean residual of one drone, its lever arm, and the residuals without it, in the world.
+
+    The mean is in the body's frame where the orientation is known.
+    """
     centred_m = np.full_like(residual_m, np.nan)
     seen = np.isfinite(residual_m).all(axis=-1)
     if not seen.any():
-        return _Offset(), centred_m
+        return {}, centred_m
     in_body = bool(np.isfinite(orientation_wxyz[seen]).all())
     frame_to_world = Rotation.identity()
     if in_body:
@@ -223,12 +215,10 @@ def _centre(
     turned_m = frame_to_world.inv().apply(residual_m[seen])
     offset_m = turned_m.mean(axis=0)
     centred_m[seen] = residual_m[seen] - frame_to_world.apply(offset_m)
-    x, y, z = offset_m.tolist()
-    standard_error_m = None
+    found = {"offset_m": tuple(offset_m.tolist()), "offset_frame": "body" if in_body else "world"}
     if len(turned_m) > 1:
-        dx, dy, dz = standard_error(turned_m).tolist()
-        standard_error_m = (dx, dy, dz)
-    return _Offset((x, y, z), standard_error_m, "body" if in_body else "world"), centred_m
+        found["offset_standard_error_m"] = tuple(standard_error(turned_m).tolist())
+    return found, centred_m
 
 
 def _errors(pair: AlignedPair, followed: Mapping[str, np.ndarray], drones: slice) -> dict[str, Any]:

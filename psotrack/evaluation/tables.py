@@ -102,9 +102,9 @@ class DroneEvaluation(Consistency, PathErrors, ErrorSummary):
     frames: int
     missed_rate: float
     offset_removed_mean_error_m: float | None
-    offset_m: tuple[float, float, float] | None
-    offset_standard_error_m: tuple[float, float, float] | None
-    offset_frame: Literal["body", "world"] | None
+    offset_m: tuple[float, float, float] | None = None
+    offset_standard_error_m: tuple[float, float, float] | None = None
+    offset_frame: Literal["body", "world"] | None = None
 
 
 @dataclass(frozen=True, repr=False)

@@ -287,7 +287,7 @@ def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
     recording = flight.recording.usable(num_frames=num_frames, videos=False)
     end_s = float(recording.timeline().time_s[-1]) + 0.5 / recording.fps
     onboard = {
-        name: replace(camera, video=replace(camera.video, num_frames=_count_until(camera.video, end_s)))
+        name: replace(camera, video=_video_until(camera.video, end_s))
         for name, camera in recording.onboard.items()
     }
     reference = recording.reference
@@ -311,8 +311,8 @@ def _cut(trajectories: Trajectories, end_s: float) -> Trajectories:
     return trajectories.at_frames(trajectories.frame[trajectories.time_s <= end_s])
 
 
-def _count_until(video: VideoInfo, end_s: float) -> int:
-    return max(1, min(video.num_frames, int(end_s * video.fps) + 1))
+def _video_until(video: VideoInfo, end_s: float) -> VideoInfo:
+    return replace(video, num_frames=max(1, min(video.num_frames, int(end_s * video.fps) + 1)))
 
 
 def read_tracks_file(path: Path | str, label: str, recording: Recording | None = None) -> FlightTracks:
