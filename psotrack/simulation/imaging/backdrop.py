@@ -147,6 +147,7 @@ class _Tree:
 #: Integer value of light 1. Lamps have light 3, which still fits into 16 bits.
 LIGHT_UNIT = 16384
 
+_Corners = Float[np.ndarray, "corners 3"]
 #: BGR light, and the floor's share of the light. OpenCV transforms four channels faster than three.
 Light = UInt16[np.ndarray, "rows columns 4"]
 #: A texture at one resolution, and the matrix from its texels to the texels at full resolution.
@@ -218,12 +219,7 @@ class RoomPainter:
         return numbers_and_depth(hiding, view)[1] if hiding else raster.empty_buffers(view)[1]
 
     def _paint_surface(
-        self,
-        image: Light,
-        view: raster.RasterView,
-        index: int,
-        corners: Float[np.ndarray, "corners 3"],
-        normal_per_height: Point,
+        self, image: Light, view: raster.RasterView, index: int, corners: _Corners, normal_per_height: Point
     ) -> None:
         K = view.K
         to_rays = np.linalg.inv(K)

@@ -152,20 +152,15 @@ class View:
             shown = layer if self._shows_px is None else layer.moved(self._shows_px)
             if shown is not None:
                 shown.draw(image)
-        for window, drones in raster.windows(
-            raster.full_view(self.cam), posed, raster.margin_px(imaging.lens_blur_px)
-        ):
-            self._draw_drones(image, window, drones)
+        blur_px, whole = imaging.lens_blur_px, raster.full_view(self.cam)
+        for window, drones in raster.windows(whole, posed, raster.margin_px(blur_px)):
+            seen = raster.average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
+            sensor.draw_over(image[window.slices], backdrop.lens_blur(seen, blur_px))
         return image
 
     def empty_room(self) -> Image:
         """(height, width, 3), BGR image of the room without drones."""
         return self._clean.copy()
-
-    def _draw_drones(self, image: Image, window: raster.RasterView, drones: list[raster.PosedDrone]) -> None:
-        seen = raster.average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
-        blurred = backdrop.lens_blur(seen, self.scene.scenario.imaging.lens_blur_px)
-        sensor.draw_over(image[window.slices], blurred)
 
 
 class OnboardRenderer:
@@ -226,7 +221,15 @@ class OnboardRenderer:
             view = replace(view, shift_px=shift_px)
             light = np.empty((*view.shape, 4), np.uint16)
             self._painter.paint(view, light)
-            self._draw_drones(light, view, posed)
+            # A drone beside the camera reaches behind the camera and has no window, but is not visible.
+            visible = [drone for drone in posed if _may_be_seen(drone, view)]
+            for window, drones in raster.windows(view, visible, raster.margin_px(0.0)):
+                faces_m = np.concatenate([drone.faces_m[0] for drone in drones])
+                seen = raster.sample(window, drones, 0, self._painter.hiding_depth_m(window, faces_m))
+                part = light[window.slices_in(view)]
+                mixed = seen[..., 3:] * part
+                mixed[..., :3] += backdrop.LIGHT_UNIT * seen[..., :3]
+                part[...] = (mixed + 0.5).astype(np.uint16)
             return light
 
         return self._lens_strips.show(strip, self.cam_at(during_s), draw)
@@ -256,24 +259,6 @@ class OnboardRenderer:
         turned_rad = Rotation.from_matrix(to_world[0].T @ to_world[1]).magnitude()
         moved_m = np.linalg.norm(position_m[1] - position_m[0])
         return float(self.K[0, 0] * (turned_rad + moved_m / _NEAR_SCENERY_M))
-
-    def _draw_drones(
-        self,
-        light: UInt16[np.ndarray, "height width 4"],
-        view: raster.RasterView,
-        posed: list[raster.PosedDrone],
-    ) -> None:
-        # A drone beside the camera reaches behind the camera and has no window, but is not visible.
-        visible = [drone for drone in posed if _may_be_seen(drone, view)]
-        for window, drones in raster.windows(view, visible, raster.margin_px(0.0)):
-            behind_m = self._painter.hiding_depth_m(
-                window, np.concatenate([drone.faces_m[0] for drone in drones])
-            )
-            seen = raster.sample(window, drones, 0, behind_m)
-            part = light[window.slices_in(view)]
-            mixed = seen[..., 3:] * part
-            mixed[..., :3] += backdrop.LIGHT_UNIT * seen[..., :3]
-            part[...] = (mixed + 0.5).astype(np.uint16)
 
     def _cast_shadows(
         self, total: Float[np.ndarray, "height width 4"], num_samples: int, time_s: float, row_px: float
