@@ -105,7 +105,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     kept = partners_per_frame(pair.distance_m, keep=True)
     kept_m = paired_values(pair.distance_m, kept)
     matched_m = paired_values(pair.distance_m, partners_per_frame(pair.distance_m, keep=False))
-    _warn_of_millimetres(pair, np.isfinite(matched_m).any())
+    _warn_of_millimetres(pair, bool(np.isfinite(matched_m).any()))
     id_switches = int(identity_switches(kept).sum())
     counted = _counted_estimates(pair, partner)
     num_known, num_estimated = int(known.sum()), int(counted.sum())

@@ -165,8 +165,8 @@ _FORESHORTENED = 2.0
 _OVERLAP_PX = 1e-6
 
 
-#: A convex part of an image: the first row, and (rows,) the first and the last column of each row.
-_Spans = tuple[int, Int[np.ndarray, "rows"], Int[np.ndarray, "rows"]]
+#: A convex part of an image: the first row, and (part,) the first and the last column of each row from there on.
+_Spans = tuple[int, Int[np.ndarray, "part"], Int[np.ndarray, "part"]]
 
 
 class RoomPainter:
