@@ -34,7 +34,7 @@ class PsotrackError(Exception):
     the message would be longer than `LONGEST_MESSAGE`.
     """
 
-    def __init__(self, where: object, expected: str, found: str, remedy: str = "") -> None:
+    def __init__(self, where: object, *, expected: str, found: str, remedy: str = "") -> None:
         place = _on_one_line(os.fspath(where) if isinstance(where, os.PathLike) else str(where))
         parts = [_on_one_line(part) for part in (expected, found, remedy)]
         # After the name of an archive, the place has the path of a file in the archive.
@@ -129,4 +129,4 @@ def check_positive(name: str, value: float, remedy: str = "") -> None:
         remedy: what the user can do, for the message.
     """
     if not 0 < value < float("inf"):
-        raise SettingsError(name, "a number above 0", f"{value:g}", remedy=remedy)
+        raise SettingsError(name, expected="a number above 0", found=f"{value:g}", remedy=remedy)

@@ -132,5 +132,7 @@ def _complete() -> None:
     from click.shell_completion import shell_complete
 
     if shell_complete(cli, {}, "psotrack", _COMPLETION_VARIABLE, instruction) != 0:
-        raise SettingsError(_COMPLETION_VARIABLE, "bash_source, zsh_source or fish_source", instruction)
+        raise SettingsError(
+            _COMPLETION_VARIABLE, expected="bash_source, zsh_source or fish_source", found=instruction
+        )
     sys.exit(0)

@@ -101,7 +101,9 @@ def live(
     from psotrack import live as filming
 
     if not (out or lines or udp or websocket or view):
-        raise SettingsError("--out", "--out FILE, --lines, --udp, --websocket or --view", "none of them")
+        raise SettingsError(
+            "--out", expected="--out FILE, --lines, --udp, --websocket or --view", found="none of them"
+        )
     if out is not None:
         check_suffix("--out", out, ".csv")
         output.refuse(out, out.with_suffix(".json"))

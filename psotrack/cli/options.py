@@ -54,9 +54,9 @@ def _read_bodies(_: click.Context, __: click.Parameter, given: tuple[str, ...]) 
             tuple(label.strip() for label in labels.split(",") if label.strip()) if equals else (f"{name}:",)
         )
         if not name or not chosen:
-            raise SettingsError("--body", "NAME=LABEL,LABEL,... or NAME", each)
+            raise SettingsError("--body", expected="NAME=LABEL,LABEL,... or NAME", found=each)
         if name in bodies:
-            raise SettingsError("--body", "each drone once", f"{name} twice")
+            raise SettingsError("--body", expected="each drone once", found=f"{name} twice")
         bodies[name] = chosen
     return bodies
 
@@ -77,7 +77,7 @@ Bodies = Annotated[
 
 def _check_picture(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and path.name and path.suffix.lower() != ".png":
-        raise SettingsError("--plot", "a file that ends in .png", path.name)
+        raise SettingsError("--plot", expected="a file that ends in .png", found=path.name)
     return path
 
 
@@ -110,7 +110,9 @@ class Extent:
 def filmed_recording(source: Path, extent: Extent) -> recordings.Recording:
     """The videos of a recording, calibrated or not, or a single video, or a folder of pictures as a recording."""
     if not source.exists():
-        raise InputError(source, "a video, a folder of pictures, or a recording", "no such file or folder")
+        raise InputError(
+            source, expected="a video, a folder of pictures, or a recording", found="no such file or folder"
+        )
     if not datasets.is_recording(source) and (source.is_file() or recordings.is_picture_folder(source)):
         # Nothing that is made from the pictures depends on their rate.
         recording = recordings.recording_of_video(
@@ -158,7 +160,10 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
     found = given or flights.find_recording(tracks)
     if found is None:
         raise InputError(
-            tracks, "a record beside the tracks that names their recording", "none", remedy="name SEQ"
+            tracks,
+            expected="a record beside the tracks that names their recording",
+            found="none",
+            remedy="name SEQ",
         )
     return found
 

@@ -77,12 +77,14 @@ def logged(path: Path) -> Iterator[None]:
 
 def _opened(path: Path) -> _Handler:
     if path == Path("-"):
-        raise OutputError(path, "the path of a log file", "-; stderr is /dev/stderr")
+        raise OutputError(path, expected="the path of a log file", found="-; stderr is /dev/stderr")
     with system_errors(path, "a log file that can be written", OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_file() and not _begins_like_a_log(path):
             # A user who names a file of tracks by mistake must not get lines of a log in it.
-            raise OutputError(path, "a new file, or a log of psotrack", "another file, which is unchanged")
+            raise OutputError(
+                path, expected="a new file, or a log of psotrack", found="another file, which is unchanged"
+            )
         handler = _Handler(path, encoding="utf-8")
     handler.setLevel(logging.INFO)
     handler.setFormatter(_Formatter())
@@ -210,7 +212,7 @@ class Output:
         files = [path for path in paths if path is not None]
         for path in files:
             if path == self.json_path:
-                raise SettingsError("--json", "another file than --out", f"{path} twice")
+                raise SettingsError("--json", expected="another file than --out", found=f"{path} twice")
         refuse_files(*files, force=self.force)
 
     def say(self, *sentences: str, always: bool = False) -> None:
@@ -265,4 +267,4 @@ class Output:
 def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
     """Raise `SettingsError` for a file that ends otherwise than an option wants."""
     if path is not None and path.suffix not in suffixes:
-        raise SettingsError(option, f"a file that ends in {' or '.join(suffixes)}", path.name)
+        raise SettingsError(option, expected=f"a file that ends in {' or '.join(suffixes)}", found=path.name)

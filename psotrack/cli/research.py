@@ -103,7 +103,9 @@ def detect(
     wanted = {f"--{name}": value for name, value in vars(what).items()}
     given = [name for name, value in wanted.items() if value]
     if len(given) != 1:
-        raise SettingsError("detect", f"one of {', '.join(wanted)}", " and ".join(given) or "none of them")
+        raise SettingsError(
+            "detect", expected=f"one of {', '.join(wanted)}", found=" and ".join(given) or "none of them"
+        )
     recording = filmed_recording(sequence, extent)
     if what.masks is not None:
         _write_masks(output, recording, what.masks, settings, extent)
@@ -254,9 +256,9 @@ def sweep(
         _status(output, status)
         return
     if grid_file is None:
-        raise SettingsError("sweep", "GRID.toml or --status DIR", "neither")
+        raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
     if workers is not None and cluster is None:
-        raise SettingsError("--workers", "--cluster local", "no --cluster")
+        raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
     from psotrack import sweeps
 
     def say(address: str) -> None:

@@ -184,7 +184,7 @@ def _check_options(tracks: Path, sequence: Path | None, to: str, out: Path, imag
     """Raise an error for options that do not fit each other, and for an output that would replace an input."""
     if images and (to != "mcap" or sequence is None):
         found = f"--to {to}" if to != "mcap" else "no SEQ"
-        raise SettingsError("--images", "--to mcap and SEQ, whose images are written", found)
+        raise SettingsError("--images", expected="--to mcap and SEQ, whose images are written", found=found)
     inputs = {tracks.resolve(): "TRACKS"}
     if tracks.suffix in {".csv", ".parquet"}:
         inputs[tracks.with_suffix(".json").resolve()] = "the place of the record of TRACKS"
@@ -193,8 +193,8 @@ def _check_options(tracks: Path, sequence: Path | None, to: str, out: Path, imag
     if out.resolve() in inputs:
         raise OutputError(
             out,
-            "another path than those of the inputs",
-            inputs[out.resolve()],
+            expected="another path than those of the inputs",
+            found=inputs[out.resolve()],
             remedy="name another one; nothing was written",
         )
 
@@ -207,7 +207,7 @@ def _sizes_m(
 
     if drone_size_m is not None:
         if not min(drone_size_m) > 0:
-            raise SettingsError("--drone-size", "lengths above 0", f"{drone_size_m}")
+            raise SettingsError("--drone-size", expected="lengths above 0", found=f"{drone_size_m}")
         return np.tile(drone_size_m, (trajectories.num_drones, 1))
     recorded = _recorded_sizes(tracks.with_suffix(".json"))
     sizes = [recorded.get(name, (np.nan,) * 3) for name in trajectories.drones]
@@ -257,7 +257,7 @@ def archive(
     if tracks.suffix == ARCHIVE_SUFFIX and not tracks.is_dir():
         if sequence is not None or videos:
             found = f"{sequence}" if sequence is not None else "--videos"
-            raise SettingsError("archive", "nothing else with an archive to unpack", found)
+            raise SettingsError("archive", expected="nothing else with an archive to unpack", found=found)
         out = out or tracks.with_suffix("")
         manifest = archives.unpack(tracks, out, force=output.force, report=output.report)
         output.say(f"{out}: {manifest.sequence}, {len(manifest.files)} files, {manifest.tracks}")

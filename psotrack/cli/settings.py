@@ -52,7 +52,9 @@ class OpenedArchive:
         try:
             settings = self.manifest.track_settings()
         except msgspec.ValidationError as error:
-            raise InputError(self.path, "settings of this version of psotrack", f"{error}") from error
+            raise InputError(
+                self.path, expected="settings of this version of psotrack", found=f"{error}"
+            ) from error
         start = self.folder / settings.init
         return settings.changed({"init": f"{start}"}) if start.is_file() else settings
 

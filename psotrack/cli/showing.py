@@ -57,7 +57,7 @@ def view(
     from psotrack.show import viewer
 
     if save is not None and web:
-        raise SettingsError("--web", "either --save or --web", "both")
+        raise SettingsError("--web", expected="either --save or --web", found="both")
     check_suffix("--save", save, ".rrd")
     viewer.check_installed()
     if save is not None:
@@ -72,7 +72,7 @@ def view(
     if extent.num_frames is not None:
         flight = flights.first_instants(flight, extent.num_frames)
     if onboard and (flight.recording is None or not flight.recording.onboard):
-        raise SettingsError("--onboard", "a recording with cameras on drones", "none")
+        raise SettingsError("--onboard", expected="a recording with cameras on drones", found="none")
     report, jobs = output.report, extent.jobs
     stored = extent.silhouettes
     content = viewer.ViewContent(

@@ -99,7 +99,7 @@ def track(
     parts = pipeline.Parts()
     if detector is not None:
         if causal:
-            raise SettingsError("--detector", "none with --causal", detector)
+            raise SettingsError("--detector", expected="none with --causal", found=detector)
         network = detection.DetectorSettings(size=detector_size, layout=detector_layout)
         parts["detector"] = detection.find_detector(detector, network)
     support.keep_compiled(compiled_folder(extent.cache))

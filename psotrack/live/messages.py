@@ -50,7 +50,7 @@ def host_and_port(option: str, address: str, *, usual_host: str = "") -> tuple[s
     host = host.removeprefix("[").removesuffix("]") or usual_host
     if not host or not 0 < (whole_number(port) or 0) < 65536:
         expected = "HOST:PORT, such as 127.0.0.1:9000"
-        raise SettingsError(option, f"PORT or {expected}" if usual_host else expected, address)
+        raise SettingsError(option, expected=f"PORT or {expected}" if usual_host else expected, found=address)
     return host, int(port)
 
 
@@ -67,7 +67,9 @@ def write_lines(stream: TextIO, rows: Trajectories) -> None:
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise OutputError("--lines", "to write rows", f"{error.strerror or error}".lower()) from error
+        raise OutputError(
+            "--lines", expected="to write rows", found=f"{error.strerror or error}".lower()
+        ) from error
 
 
 class UdpLines:
@@ -85,7 +87,7 @@ class UdpLines:
         try:
             family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
-            raise SettingsError("--udp", "a host that is known", host) from error
+            raise SettingsError("--udp", expected="a host that is known", found=host) from error
         self._address, self._target, self._said = address, target, ""
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
 
@@ -152,7 +154,9 @@ class WebSocketLines:
             from websockets.asyncio.server import broadcast, serve
         except ModuleNotFoundError as error:
             expected, remedy = "the package websockets", install_command("live")
-            raise SettingsError("--websocket", expected, "it is not installed", remedy=remedy) from error
+            raise SettingsError(
+                "--websocket", expected=expected, found="it is not installed", remedy=remedy
+            ) from error
         self.address = f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
         self.num_clients = 0
         self._broadcast = broadcast
@@ -178,7 +182,7 @@ class WebSocketLines:
         except OSError as error:
             self._loop.close()
             expected, found = "an address of this computer that is free", f"{error.strerror or error}".lower()
-            raise OutputError(f"--websocket {address}", expected, found) from error
+            raise OutputError(f"--websocket {address}", expected=expected, found=found) from error
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
 

@@ -186,7 +186,7 @@ def recording_folder(
     for name, (width, height) in zip(names, rig.cameras.image_size_wh.astype(int).tolist(), strict=True):
         if width % 2 or height % 2:
             expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
-            raise SettingsError("--record", expected, f"{width} x {height} of camera {name}")
+            raise SettingsError("--record", expected=expected, found=f"{width} x {height} of camera {name}")
     tables = {name: _table(recording.by_name[name]) for name in names}
     with system_errors(folder, "a folder that can be written", OutputError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -212,11 +212,13 @@ def recording_folder(
 
 def _check_folder(folder: Path, recording: Recording, force: bool) -> None:
     if folder.resolve() == recording.folder.resolve():
-        raise SettingsError("--record", "another folder", "that of the cameras' recording.toml")
+        raise SettingsError(
+            "--record", expected="another folder", found="that of the cameras' recording.toml"
+        )
     if not force and folder.is_dir() and any(folder.iterdir()):
         expected, found = "a new or an empty folder", "a folder with files"
         remedy = "pass --force to replace an earlier recording in it"
-        raise OutputError(folder, expected, found, remedy=remedy)
+        raise OutputError(folder, expected=expected, found=found, remedy=remedy)
 
 
 def _table(camera: CameraRecording) -> CameraTable:

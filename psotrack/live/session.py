@@ -162,7 +162,7 @@ class LiveSession:
             if num_able >= 2:
                 expected, found = "frames", "none until the session ended"
             remedy = "the lines above say why" if num_able < count else ""
-            raise InputError("the cameras", expected, found, remedy=remedy)
+            raise InputError("the cameras", expected=expected, found=found, remedy=remedy)
 
     def _track(self, instant: Instant, outputs: list[RowsOutput]) -> None:
         images = np.zeros(self._shape, np.uint8)

@@ -230,7 +230,7 @@ class CameraStream:
             expected = "images of {} x {} pixels, as the rig says".format(*self.image_size_wh)
             found = f"{image.shape[1]} x {image.shape[0]}"
             remedy = "let the camera send this size, or calibrate the camera at the size that it sends"
-            raise InputError(shown_address(self.address), expected, found, remedy=remedy)
+            raise InputError(shown_address(self.address), expected=expected, found=found, remedy=remedy)
 
     def _opened(self) -> cv2.VideoCapture:
         with silence_opencv():
@@ -240,7 +240,7 @@ class CameraStream:
                 if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
                     expected, found = "a build of OpenCV with GStreamer", "OpenCV without GStreamer"
                     remedy = "build OpenCV from source with GStreamer, or take an address of RTSP or HTTP"
-                    raise InputError(self.address, expected, found, remedy=remedy)
+                    raise InputError(self.address, expected=expected, found=found, remedy=remedy)
                 return cv2.VideoCapture(self.address.removeprefix("gstreamer://"), cv2.CAP_GSTREAMER)
             limit_ms = round(1000 * ANSWER_S)
             limits = cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms
@@ -359,5 +359,5 @@ def live_cameras(
         what = "videos" if replay else "the address of a stream or the number of a device as `video`"
         expected, there = f"at least two cameras of the rig with {what}", [each.name for each in found]
         remedy = "" if replay else "--replay plays the videos of a recording"
-        raise InputError(recording.folder, expected, ", ".join(there) or "none", remedy=remedy)
+        raise InputError(recording.folder, expected=expected, found=", ".join(there) or "none", remedy=remedy)
     return found

@@ -38,7 +38,9 @@ def causal_settings(settings: TrackSettings) -> TrackSettings:
     allowed = {"method": "swarm", "smooth": False, "init": "auto", "clocks": "given"}
     for name, value in allowed.items():
         if getattr(settings, name) != value:
-            raise SettingsError(name, f"{value} without the future", f"{getattr(settings, name)}")
+            raise SettingsError(
+                name, expected=f"{value} without the future", found=f"{getattr(settings, name)}"
+            )
     return settings.changed({"silhouettes.first_look": False})
 
 

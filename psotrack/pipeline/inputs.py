@@ -139,10 +139,10 @@ def check_detector_is_used(settings: TrackSettings, method: Method | None) -> No
     if settings.method == "swarm" if method is None else not method.reads_detections:
         name = settings.method if method is None else type(method).__name__
         expected = "a method that reads detections, such as projection-lines or fused"
-        raise SettingsError("detector", expected, f"method {name}")
+        raise SettingsError("detector", expected=expected, found=f"method {name}")
     if settings.detections != YOLO:
         found = f"detections {settings.detections} as well"
-        raise SettingsError("detector", "detections from one source", found)
+        raise SettingsError("detector", expected="detections from one source", found=found)
 
 
 logger = logging.getLogger(__name__)
@@ -180,22 +180,22 @@ def usable_for(
     if len(names) < 2:
         raise InputError(
             recording.folder,
-            "at least two cameras that can be used, because one camera does not show distances",
-            ", ".join(names),
+            expected="at least two cameras that can be used, because one camera does not show distances",
+            found=", ".join(names),
         )
     if not views_meet(usable.rig.cameras):
         raise InputError(
             recording.folder,
-            "cameras of which two have a place in view together",
-            f"that no views of {', '.join(names)} meet",
+            expected="cameras of which two have a place in view together",
+            found=f"that no views of {', '.join(names)} meet",
             remedy="check the places and directions of the cameras in the calibration",
         )
     shown = [each.name for each in usable.cameras if each.video or each.silhouettes]
     if settings.needs_silhouettes and len(shown) < 2:
         raise InputError(
             recording.folder,
-            f"videos of at least two cameras for --method {settings.method}",
-            ", ".join(shown) or "none",
+            expected=f"videos of at least two cameras for --method {settings.method}",
+            found=", ".join(shown) or "none",
             remedy="--method projection-lines needs detections only",
         )
     return usable
@@ -212,8 +212,8 @@ def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
     if not recording.detections:
         raise InputError(
             recording.folder,
-            "detections in dl_data or in recording.toml",
-            "none",
+            expected="detections in dl_data or in recording.toml",
+            found="none",
             remedy="use --detections blobs, or --detections FOLDER",
         )
     return {name: path for name, path in recording.detections.items() if name in recording.rig.names}

@@ -315,7 +315,7 @@ def _no_drones(run: Run) -> InputError:
             share = f"{met} of {seen} frames"
             found += f", and detections of different cameras that meet in a place in {share}"
             remedy = f"check the rig, its unit and the clocks: `psotrack doctor {shlex.quote(f'{recording.folder}')}`"
-    return InputError(recording.folder, "drones", found, remedy=remedy)
+    return InputError(recording.folder, expected="drones", found=found, remedy=remedy)
 
 
 def environment() -> dict[str, Any]:

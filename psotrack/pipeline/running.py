@@ -172,7 +172,7 @@ def track_runs(
     """
     check_parts(parts)
     if silhouettes is None and ("method" in parts or any(each.needs_silhouettes for each in settings)):
-        raise SettingsError("silhouettes", "silhouettes of all cameras", "none")
+        raise SettingsError("silhouettes", expected="silhouettes of all cameras", found="none")
     tracked = _track(recording, silhouettes, settings, parts, report)
     return [finish(run, result) for run, result in tracked]
 

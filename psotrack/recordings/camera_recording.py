@@ -76,16 +76,16 @@ def probe_silhouettes(path: Path | str) -> StoredSilhouettes:
     file, remedy = path / ARRAY_FILE, "silhouettes of an archive, and those that this version stores, say it"
     expected = "the description of silhouettes that say what they were made of"
     if not file.is_file():
-        raise InputError(path, "a folder with stored silhouettes", f"no {ARRAY_FILE}")
+        raise InputError(path, expected="a folder with stored silhouettes", found=f"no {ARRAY_FILE}")
     content = read_json(file, expected, remedy)
     try:
         made_of, shape = content["attributes"][MADE_OF], content["shape"]
         num_frames = msgspec.convert(made_of, _MadeOf).num_frames
         stored = msgspec.convert(shape, tuple[int, int, int])[0]
     except (KeyError, TypeError, msgspec.ValidationError) as error:
-        raise InputError(file, expected, f"{error}", remedy=remedy) from error
+        raise InputError(file, expected=expected, found=f"{error}", remedy=remedy) from error
     if stored != num_frames:
-        raise InputError(file, f"{num_frames} frames", f"{stored}")
+        raise InputError(file, expected=f"{num_frames} frames", found=f"{stored}")
     return StoredSilhouettes(path, stored, made_of)
 
 
@@ -184,8 +184,8 @@ class CameraRecording:
         )
         raise InputError(
             self.video.path,
-            f"{width} x {height} pixels as calibrated",
-            f"{found_w} x {found_h} pixels",
+            expected=f"{width} x {height} pixels as calibrated",
+            found=f"{found_w} x {found_h} pixels",
             remedy=remedy,
         )
 
@@ -207,8 +207,8 @@ class CameraRecording:
         if beyond == len(frame):
             raise InputError(
                 path,
-                f"detections in the frames 0 to {last} of camera {self.name} ({shown})",
-                f"none before frame {int(frame[0])}",
+                expected=f"detections in the frames 0 to {last} of camera {self.name} ({shown})",
+                found=f"none before frame {int(frame[0])}",
                 remedy="are they detections in another video?",
             )
         _logger.warning(

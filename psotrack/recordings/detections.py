@@ -38,7 +38,7 @@ class Detections:
 
     def __post_init__(self) -> None:
         if np.any(np.diff(self.frame) < 0):
-            raise InputError("detections.frame", "increasing frame numbers", "steps back")
+            raise InputError("detections.frame", expected="increasing frame numbers", found="steps back")
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -95,8 +95,8 @@ def _boxes(row: TextRow) -> list[tuple[float, ...]]:
     if num_values % size:
         raise InputError(
             row.where,
-            f"a frame number and {size} values per detection ({', '.join(_VALUES)})",
-            f"{num_values} values",
+            expected=f"a frame number and {size} values per detection ({', '.join(_VALUES)})",
+            found=f"{num_values} values",
         )
     starts = range(1, num_values + 1, size)
     return [_box(row, start) for start in starts if any(row.cells[start : start + size])]

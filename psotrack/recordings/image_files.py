@@ -128,7 +128,7 @@ def read_image(path: Path, depth_bits: int = 16) -> UInt8[np.ndarray, "height wi
     if image.dtype == np.uint16:
         image = np.minimum(image >> (depth_bits - 8), 255)
     elif image.dtype != np.uint8:
-        raise InputError(path, "an image of 8 or 16 bits", f"one of {image.dtype}")
+        raise InputError(path, expected="an image of 8 or 16 bits", found=f"one of {image.dtype}")
     return image.astype(np.uint8)
 
 
@@ -197,7 +197,7 @@ def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
     if image is None:
         is_png = data.startswith(_PNG)
         found = "a PNG that is cut short or damaged" if is_png else "a file that OpenCV cannot decode"
-        raise InputError(path, "an image", found)
+        raise InputError(path, expected="an image", found=found)
     said = next((line.decode().strip() for line in lines if line.startswith(_OF_LIBJPEG)), None)
     if said is not None:
         logger.warning("%s is damaged (%s)", path, said)
@@ -212,7 +212,7 @@ def check_pixels(where: object, width: int, height: int) -> None:
         expected = f"images of at most {MOST_SIDE} pixels a side"
     else:
         return
-    raise InputError(where, expected, f"{width} x {height} pixels")
+    raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
 
 
 def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
@@ -228,11 +228,11 @@ def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
                 return image.size
     except Image.DecompressionBombError as error:
         found = str(error).partition("(")[2].partition(")")[0]
-        raise InputError(where, f"images of at most {MOST_PIXELS} pixels", found) from error
+        raise InputError(where, expected=f"images of at most {MOST_PIXELS} pixels", found=found) from error
     # Of the other formats that OpenCV decodes, a few bytes can take gigabytes. A damaged header leads to any error.
     except Exception as error:
         found = f"a file that is no PNG, {', '.join(_FORMATS)}, or a damaged one"
-        raise InputError(where, "an image", found) from error
+        raise InputError(where, expected="an image", found=found) from error
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:
@@ -251,5 +251,5 @@ def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:
     )
     files = tuple(path for path in found if path.is_file())
     if not files:
-        raise InputError(where, "a pattern that fits image files, such as left/*.png", pattern)
+        raise InputError(where, expected="a pattern that fits image files, such as left/*.png", found=pattern)
     return files

@@ -38,7 +38,10 @@ def open_video(path: Path | str, fps: float | None = None) -> VideoInfo:
         return open_pictures(path, fps)
     if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
         raise InputError(
-            path, "a video, or a folder of pictures", "one picture", remedy=f"name its folder, {path.parent}"
+            path,
+            expected="a video, or a folder of pictures",
+            found="one picture",
+            remedy=f"name its folder, {path.parent}",
         )
     video = probe(path)
     if fps is None:
@@ -51,12 +54,12 @@ def open_pictures(folder: Path, fps: float | None) -> VideoInfo:
     """A folder of pictures as a video; see `open_video`. Missing numbers among the pictures are a warning."""
     paths = image_files(folder)
     if not paths:
-        raise InputError(folder, f"images, which end in {', '.join(IMAGE_SUFFIXES)}", "none")
+        raise InputError(folder, expected=f"images, which end in {', '.join(IMAGE_SUFFIXES)}", found="none")
     if fps is None:
         raise InputError(
             folder,
-            "the rate of its pictures, because pictures do not state it",
-            "none",
+            expected="the rate of its pictures, because pictures do not state it",
+            found="none",
             remedy="state it as fps, in frames per second",
         )
     warn_of_missing_numbers(folder, paths)

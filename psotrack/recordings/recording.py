@@ -237,7 +237,7 @@ class Recording:
         times = {each.name: each.exposed for each in self._timed}
         known = [each for each in times.values() if each is not None]
         if not known:
-            raise InputError(self.folder, "at least one video", "none")
+            raise InputError(self.folder, expected="at least one video", found="none")
         none = replace(known[0], num_frames=0, listed_s=None)
         return {name: none if each is None else each for name, each in times.items()}
 
@@ -287,8 +287,8 @@ class Recording:
             if each.stream is not None:
                 raise InputError(
                     f"{self.folder}, camera {each.name}",
-                    "a video file",
-                    f"the stream {each.stream}",
+                    expected="a video file",
+                    found=f"the stream {each.stream}",
                     remedy="record it first: this command works on files",
                 )
         faults = {each.name: each.lacks(videos=videos, silhouettes=silhouettes) for each in asked}
@@ -338,15 +338,15 @@ class Recording:
         if all(each.camera is None for each in asked):
             return InputError(
                 self.folder,
-                "cameras whose lens and place are known",
-                f"none for {names}",
+                expected="cameras whose lens and place are known",
+                found=f"none for {names}",
                 remedy="make a calibration with `psotrack calibrate rig`",
             )
         stored = any(each.silhouettes for each in without)
         return InputError(
             self.folder,
-            f"{'a video' if videos else 'a video, or detections,'} for each of the cameras {names}",
-            f"none for {', '.join(each.name for each in without)}",
+            expected=f"{'a video' if videos else 'a video, or detections,'} for each of the cameras {names}",
+            found=f"none for {', '.join(each.name for each in without)}",
             remedy="stored silhouettes do not show the images" if stored else "",
         )
 
@@ -355,7 +355,7 @@ class Recording:
         timeline = self.timeline()
         if not 0 < num_frames <= timeline.num_instants:
             expected = f"1 to {timeline.num_instants}, the frames of the recording"
-            raise SettingsError("frames", expected, f"{num_frames}")
+            raise SettingsError("frames", expected=expected, found=f"{num_frames}")
         counts = (timeline.frame[:num_frames].max(axis=0) + 1).tolist()
         kept = []
         for each, count in zip(self.cameras, counts, strict=True):
@@ -367,7 +367,9 @@ class Recording:
                 )
         if not kept:
             raise SettingsError(
-                "frames", "instants in which a camera has a frame", f"none of the first {num_frames}"
+                "frames",
+                expected="instants in which a camera has a frame",
+                found=f"none of the first {num_frames}",
             )
         late = len(kept) < len(self.cameras)
         # Without its fastest camera the recording would have other instants; and a camera's last frame may be near

@@ -214,7 +214,7 @@ def _check_bounds(path: Path, world: WorldTable) -> None:
 def file_error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
     """Error about a place in a `recording.toml`; an empty place is the whole file."""
     where = f"{path}, {place}" if place else path
-    return InputError(where, expected, found, remedy=remedy)
+    return InputError(where, expected=expected, found=found, remedy=remedy)
 
 
 def write_recording_file(path: Path | str, content: RecordingFile) -> None:

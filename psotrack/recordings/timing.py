@@ -48,7 +48,9 @@ def check_rate(where: object, fps: float, remedy: str = "") -> None:
     """
     low, high = RATES_HZ
     if not low <= fps <= high:
-        raise InputError(where, f"{low:g} to {high:.0f} frames per second", f"{fps:g}", remedy=remedy)
+        raise InputError(
+            where, expected=f"{low:g} to {high:.0f} frames per second", found=f"{fps:g}", remedy=remedy
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,9 +78,11 @@ class FrameTimes:
     def __post_init__(self) -> None:
         check_positive("fps", self.fps)
         if not 0 <= self.num_frames <= MOST_INSTANTS:
-            raise SettingsError("num_frames", f"a number from 0 to {MOST_INSTANTS}", f"{self.num_frames}")
+            raise SettingsError(
+                "num_frames", expected=f"a number from 0 to {MOST_INSTANTS}", found=f"{self.num_frames}"
+            )
         if not np.isfinite(self.time_offset_s):
-            raise SettingsError("time_offset_s", "a finite number", f"{self.time_offset_s:g}")
+            raise SettingsError("time_offset_s", expected="a finite number", found=f"{self.time_offset_s:g}")
 
     @classmethod
     def listed(cls, time_s: Float[np.ndarray, "frames"], where: object = "timestamps") -> FrameTimes:
@@ -93,16 +97,16 @@ class FrameTimes:
                 before it, or the rate is one with which no camera films drones.
         """
         if len(time_s) < 2:
-            raise InputError(where, "times of at least 2 frames", f"{len(time_s)}")
+            raise InputError(where, expected="times of at least 2 frames", found=f"{len(time_s)}")
         if not np.isfinite(time_s).all():
             frame = int(np.flatnonzero(~np.isfinite(time_s))[0])
-            raise InputError(where, "finite times", f"{time_s[frame]} s for frame {frame}")
+            raise InputError(where, expected="finite times", found=f"{time_s[frame]} s for frame {frame}")
         again = first_repeat(time_s)
         if again is not None:
             raise InputError(
                 where,
-                "times that increase from frame to frame",
-                f"{time_s[again]:g} s for frame {again} after {time_s[again - 1]:g} s",
+                expected="times that increase from frame to frame",
+                found=f"{time_s[again]:g} s for frame {again} after {time_s[again - 1]:g} s",
             )
         fps = float(1 / np.median(np.diff(time_s)))
         check_rate(where, fps, "are the times in seconds?")
@@ -166,7 +170,9 @@ def read_timestamps(path: Path | str, num_frames: int | None = None) -> FrameTim
             raise row.error(frame_column, expected, row.text(frame_column))
     time_s = np.array([row.number(time_column) for row in table.rows])
     if num_frames is not None and len(time_s) != num_frames:
-        raise InputError(path, f"times of the {num_frames} frames of the video", f"{len(time_s)}")
+        raise InputError(
+            path, expected=f"times of the {num_frames} frames of the video", found=f"{len(time_s)}"
+        )
     return FrameTimes.listed(time_s, path)
 
 
@@ -288,8 +294,8 @@ def make_timeline(frame_times: Mapping[str, FrameTimes], rate_hz: float | None =
         if later_s:
             expected = f"a camera with a frame near one of the instants, {rate:g} Hz from time 0 s on"
             found = f"frames from {min(later_s):g} to {max(later_s):g} s"
-            raise InputError("frame times", expected, found, remedy="choose another rate")
-        raise InputError("frame times", "a camera with a frame at time 0 s or later", "none")
+            raise InputError("frame times", expected=expected, found=found, remedy="choose another rate")
+        raise InputError("frame times", expected="a camera with a frame at time 0 s or later", found="none")
     return timeline
 
 
@@ -308,7 +314,9 @@ def _check_length(frame_times: Mapping[str, FrameTimes], rate_hz: float) -> None
     if begin_s > end_s - begin_s:
         of_first = f"{begin_s:.2f} s, the time of the first frame of camera {first}, from all times"
         remedy = f"the clock must begin with the recording: subtract {of_first}"
-    raise InputError("frame times", f"at most {MOST_INSTANTS} instants from time 0 on", found, remedy=remedy)
+    raise InputError(
+        "frame times", expected=f"at most {MOST_INSTANTS} instants from time 0 on", found=found, remedy=remedy
+    )
 
 
 def _of_equal_frames(names: tuple[str, ...], times: list[FrameTimes], longest: FrameTimes) -> Timeline:

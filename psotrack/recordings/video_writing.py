@@ -67,7 +67,7 @@ class VideoEncoder:
         width, height = self._size_wh
         # OpenCV drops such a frame without an error.
         if bgr.shape != (height, width, 3):
-            raise SettingsError("frame", f"shape {(height, width, 3)}", f"{bgr.shape}")
+            raise SettingsError("frame", expected=f"shape {(height, width, 3)}", found=f"{bgr.shape}")
         with silence_opencv():
             self._writer.write(bgr)
         self.num_frames += 1
@@ -102,7 +102,7 @@ def encoded_video(
         try:
             encoder = VideoEncoder(temporary, codec, fps, image_size_wh, settings)
         except OSError as error:
-            raise OutputError(path, "a video that can be written", str(error)) from error
+            raise OutputError(path, expected="a video that can be written", found=str(error)) from error
         try:
             yield encoder
         finally:
@@ -137,13 +137,13 @@ class VideoWriter:
     def __init__(self, path: Path | str, fps: float, image_size_wh: tuple[int, int]) -> None:
         path = Path(path)
         if path.suffix.lower() != ".avi":
-            raise SettingsError("video", "a file name ending in .avi", path.name)
+            raise SettingsError("video", expected="a file name ending in .avi", found=path.name)
         check_positive("fps", fps)
         if any(side < 2 or side % 2 for side in image_size_wh):
             raise SettingsError(
                 "image size",
-                "even numbers of pixels, because the codec halves the resolution of colours",
-                f"{image_size_wh[0]} x {image_size_wh[1]}",
+                expected="even numbers of pixels, because the codec halves the resolution of colours",
+                found=f"{image_size_wh[0]} x {image_size_wh[1]}",
             )
         self._video = encoded_video(path, _CODEC, fps, image_size_wh)
 
@@ -172,9 +172,11 @@ def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
     first = videos[0]
     for video in videos:
         if not _has_its_end(video.path):
-            raise InputError(video.path, "a whole video", "one that is cut short")
+            raise InputError(video.path, expected="a whole video", found="one that is cut short")
         if (video.fps, video.image_size_wh) != (first.fps, first.image_size_wh):
-            raise InputError(video.path, f"{_kind(first)} as in {first.path.name}", _kind(video))
+            raise InputError(
+                video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
+            )
     with encoded_video(path, _CODEC, first.fps, first.image_size_wh, _CODED) as encoder:
         for video in videos:
             _copy_packets(video, encoder)
@@ -192,14 +194,14 @@ def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
         OutputError: a frame or the index of frames is missing, or there is no frame.
     """
     if not num_frames:
-        raise OutputError(path, "at least one frame", "0 written")
+        raise OutputError(path, expected="at least one frame", found="0 written")
     # The header may count frames that are missing: count the frames themselves.
     found = len(packet_times(temporary))
     if found != num_frames or not _has_its_end(temporary):
         raise OutputError(
             path,
-            f"a file with {num_frames} frames",
-            f"{found} written" if found != num_frames else "an incomplete index of frames",
+            expected=f"a file with {num_frames} frames",
+            found=f"{found} written" if found != num_frames else "an incomplete index of frames",
             remedy="is the disk full? earlier results are unchanged",
         )
 

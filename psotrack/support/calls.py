@@ -95,7 +95,9 @@ def _check(name: str, values: Mapping[str, Any], annotations: Mapping[str, Any],
         if argument in annotations and argument not in ("more", "parts"):
             annotation = annotations[argument]
             if not _fits(value, annotation, shapes):
-                raise SettingsError(f"{name}, {argument}", _expected(annotation), short_text(value))
+                raise SettingsError(
+                    f"{name}, {argument}", expected=_expected(annotation), found=short_text(value)
+                )
 
 
 def _fits(value: Any, annotation: Any, shapes: bool) -> bool:

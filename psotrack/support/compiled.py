@@ -34,7 +34,9 @@ def use_device(device: Device) -> None:
     remedy = _GPU_NEEDS if device == "gpu" else ""
     found = _backend("--device", f"a {device}", remedy)
     if found != device:
-        raise SettingsError("--device", f"a {device}", f"{found} in use already", remedy=remedy)
+        raise SettingsError(
+            "--device", expected=f"a {device}", found=f"{found} in use already", remedy=remedy
+        )
 
 
 def check_devices() -> None:
@@ -49,7 +51,7 @@ def _backend(where: str, expected: str, remedy: str) -> str:
     except (RuntimeError, AssertionError) as error:
         # JAX raises AssertionError if it is installed without support for the device.
         why = str(error).partition("\n")[0] or "no device that JAX can use"
-        raise SettingsError(where, expected, why, remedy=remedy) from error
+        raise SettingsError(where, expected=expected, found=why, remedy=remedy) from error
 
 
 def share_processors(count: int | None = None) -> None:

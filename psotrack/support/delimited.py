@@ -61,7 +61,7 @@ class NumberLines:
 
     def error(self, row: int, *, expected: str, found: str) -> InputError:
         """Error whose message names file and line of a row."""
-        return InputError(f"{self.path}, line {self.lines[row]}", expected, found)
+        return InputError(f"{self.path}, line {self.lines[row]}", expected=expected, found=found)
 
 
 def read_numbers(path: Path, columns: int, expected: str, *, more: bool = False) -> NumberLines:
@@ -88,11 +88,11 @@ def read_numbers(path: Path, columns: int, expected: str, *, more: bool = False)
             found = repr(line.strip()[:80])
             # Decimal commas look like twice the numbers.
             points = ", with decimal points" if len(line.split()) == columns < len(words) else ""
-            raise InputError(f"{path}, line {number}", f"{expected}{points}", found)
+            raise InputError(f"{path}, line {number}", expected=f"{expected}{points}", found=found)
         rows.append(values)
         lines.append(number)
     if not rows:
-        raise InputError(path, "at least one line with numbers", "none")
+        raise InputError(path, expected="at least one line with numbers", found="none")
     return NumberLines(path, np.array(rows), lines)
 
 
@@ -174,7 +174,9 @@ class TextRow:
 
     def error(self, column: Column, expected: str, found: str, remedy: str = "") -> InputError:
         """Error whose message names this line and the column."""
-        return InputError(f"{self.where}, column {column.header}", expected, found, remedy=remedy)
+        return InputError(
+            f"{self.where}, column {column.header}", expected=expected, found=found, remedy=remedy
+        )
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,9 @@ class Table:
         found = self.find(name)
         if found is None:
             raise InputError(
-                self.path, f"a column {name}", f"only {', '.join(column.header for column in self.columns)}"
+                self.path,
+                expected=f"a column {name}",
+                found=f"only {', '.join(column.header for column in self.columns)}",
             )
         return found
 
@@ -207,7 +211,7 @@ class Table:
         """
         if column.unit not in units:
             allowed = " or ".join(f"{column.name}[{unit}]" if unit else column.name for unit in units)
-            raise InputError(self.path, f"a column {allowed}", column.header)
+            raise InputError(self.path, expected=f"a column {allowed}", found=column.header)
         return units[column.unit]
 
 
@@ -223,7 +227,7 @@ def read_rows(path: Path | str, separator: str) -> list[TextRow]:
         cells = tuple(cell.strip() for cell in line.split(separator))
         if max(map(len, cells)) > _LONGEST_CELL:
             expected = f"cells of at most {_LONGEST_CELL} characters, separated by {separator!r}"
-            raise InputError(f"{path}, line {number}", expected, "a longer one")
+            raise InputError(f"{path}, line {number}", expected=expected, found="a longer one")
         if any(cells):
             # A separator at the end of a line ends the last cell; no empty cell follows.
             rows.append(TextRow(path, number, cells[:-1] if len(cells) > 1 and not cells[-1] else cells))
@@ -246,20 +250,22 @@ def read_table(path: Path | str, separator: str = ";", *, has_gaps: bool = False
     header, *rows = read_rows(path, separator) or [TextRow(path, 1, ("",))]
     if len(header.cells) < 2:
         found = repr(header.cells[0][:60]) if header.cells[0] else "an empty file"
-        raise InputError(header.where, f"columns separated by {separator!r}", found)
+        raise InputError(header.where, expected=f"columns separated by {separator!r}", found=found)
     columns = tuple(_column(index, cell) for index, cell in enumerate(header.cells))
     names = [column.name for column in columns]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise InputError(header.where, "each column once", f"{', '.join(twice)} again")
+        raise InputError(header.where, expected="each column once", found=f"{', '.join(twice)} again")
     if not rows:
-        raise InputError(path, "rows below the header", "none")
+        raise InputError(path, expected="rows below the header", found="none")
     if has_gaps:
         short = len(columns) - 1
         rows = [replace(row, cells=(*row.cells, "")) if len(row.cells) == short else row for row in rows]
     for row in rows:
         if len(row.cells) != len(columns):
-            raise InputError(row.where, f"{len(columns)} values as in the header", f"{len(row.cells)}")
+            raise InputError(
+                row.where, expected=f"{len(columns)} values as in the header", found=f"{len(row.cells)}"
+            )
     return Table(path, columns, tuple(rows))
 
 

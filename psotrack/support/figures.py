@@ -74,7 +74,7 @@ def save_figure(
         OutputError: the path does not end in .png, the file exists and `force` is not set, or it cannot be written.
     """
     if Path(path).suffix.lower() != ".png":
-        raise OutputError(path, "a file that ends in .png", Path(path).name)
+        raise OutputError(path, expected="a file that ends in .png", found=Path(path).name)
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -65,18 +65,22 @@ def refuse_to_overwrite(path: Path | str, force: bool) -> None:
     path = Path(path)
     if path == Path("-"):
         # A file of this name would surprise users who mean stdout.
-        raise OutputError(path, "the path of a file or folder", "-, which is stdout for --json only")
+        raise OutputError(
+            path, expected="the path of a file or folder", found="-, which is stdout for --json only"
+        )
     if _takes_bytes(path):
         return
     if path.exists() and not force:
         found = "an existing folder" if path.is_dir() else "an existing file"
-        raise OutputError(path, "a path that does not exist yet", found, remedy="pass --force to replace it")
+        raise OutputError(
+            path, expected="a path that does not exist yet", found=found, remedy="pass --force to replace it"
+        )
     folder = end_of_links(path).parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
         found = f"{folder}, which cannot be written" if folder.is_dir() else f"{folder}, which is no folder"
-        raise OutputError(path, "a path in a folder that can be written", found)
+        raise OutputError(path, expected="a path in a folder that can be written", found=found)
 
 
 def refuse_files(*paths: Path | str, force: bool) -> None:
@@ -90,7 +94,7 @@ def _refuse_folder(path: Path) -> None:
     # Even with `force`: a user who names a folder by mistake must not lose the folder's content.
     if path.is_dir():
         remedy = "name a file; the content of the folder is unchanged"
-        raise OutputError(path, "the path of a file", "a folder", remedy=remedy)
+        raise OutputError(path, expected="the path of a file", found="a folder", remedy=remedy)
 
 
 @contextlib.contextmanager
@@ -234,8 +238,8 @@ def _errors_of(outputs: Sequence[_Output]) -> Iterator[None]:
         output = (named or outputs)[-1]
         raise OutputError(
             output.path,
-            "a path that can be written",
-            error.strerror or str(error),
+            expected="a path that can be written",
+            found=error.strerror or str(error),
             remedy="earlier results are unchanged",
         ) from error
     except OutputError as error:
@@ -274,7 +278,9 @@ def end_of_links(path: Path) -> Path:
         end = path.resolve()
         if not end.is_symlink():
             return end
-    raise OutputError(path, "a link that leads to a file", "a link that leads to itself", remedy="remove it")
+    raise OutputError(
+        path, expected="a link that leads to a file", found="a link that leads to itself", remedy="remove it"
+    )
 
 
 def read_text(path: Path | str) -> str:
@@ -288,7 +294,9 @@ def read_text(path: Path | str) -> str:
         with system_errors(path, "a file to read"):
             text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(path, "UTF-8 text", f"an invalid byte at offset {error.start}") from error
+        raise InputError(
+            path, expected="UTF-8 text", found=f"an invalid byte at offset {error.start}"
+        ) from error
     check_no_nul(path, text)
     return text
 
@@ -304,13 +312,13 @@ def check_kind(path: Path | str, expected: str) -> None:
         start = file.read(100).removeprefix(b"\xef\xbb\xbf")
         for first, (found, remedy) in _OTHERS.items():
             if start.startswith(first):
-                raise InputError(path, expected, found, remedy=remedy)
+                raise InputError(path, expected=expected, found=found, remedy=remedy)
 
 
 def check_no_nul(path: Path | str, text: str) -> None:
     """Raise `InputError` for a NUL, which no text has: the file is damaged, or is text in UTF-16 or UTF-32."""
     if "\0" in text:
-        raise InputError(path, "UTF-8 text", f"a NUL at character {text.index(chr(0))}")
+        raise InputError(path, expected="UTF-8 text", found=f"a NUL at character {text.index(chr(0))}")
 
 
 def check_file_name(name: str, where: object) -> str:
@@ -328,8 +336,8 @@ def check_file_name(name: str, where: object) -> str:
     if not is_plain or set(name) & set('/\\:*?"<>|') or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
             where,
-            "names that can be names of files",
-            repr(name),
+            expected="names that can be names of files",
+            found=repr(name),
             remedy="rename it: no / \\ : and other marks of paths",
         )
     return name

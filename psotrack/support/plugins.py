@@ -60,10 +60,10 @@ def register_plugin(kind: PluginKind, name: str, make: Callable[[Any], Any]) -> 
         SettingsError: there is no such kind of plugins, or `make` cannot be called.
     """
     if kind not in GROUPS:
-        raise SettingsError("kind", f"one of {', '.join(get_args(PluginKind))}", f"{kind}")
+        raise SettingsError("kind", expected=f"one of {', '.join(get_args(PluginKind))}", found=f"{kind}")
     if not callable(make):
         found = f"an object of {type(make).__name__}"
-        raise SettingsError(f"{kind} {name}", "a function of the settings, or a class", found)
+        raise SettingsError(f"{kind} {name}", expected="a function of the settings, or a class", found=found)
     _registered[kind, name] = make
 
 
@@ -120,8 +120,8 @@ def check_interface(where: str, part: object, interface: type) -> None:
     if not isinstance(part, interface):
         raise SettingsError(
             where,
-            f"an object with the attributes of psotrack.{interface.__name__}",
-            f"an object of {type(part).__name__}",
+            expected=f"an object with the attributes of psotrack.{interface.__name__}",
+            found=f"an object of {type(part).__name__}",
         )
 
 
@@ -143,7 +143,9 @@ def identify(part: Any) -> dict[str, Any]:
     try:
         key = json.loads(json.dumps(dict(part.key)))
     except (TypeError, ValueError) as error:
-        raise SettingsError(f"key of {name}", "a mapping of plain data, fit for JSON", f"{error}") from error
+        raise SettingsError(
+            f"key of {name}", expected="a mapping of plain data, fit for JSON", found=f"{error}"
+        ) from error
     return {"class": name, "key": key}
 
 
@@ -154,18 +156,20 @@ def _load(kind: PluginKind, name: str, setting: str, built_in: Sequence[str]) ->
         try:
             make = point.load()
         except (ImportError, AttributeError) as error:
-            raise SettingsError(f"{setting} {name}", f"{point.value} to be importable", f"{error}") from error
+            raise SettingsError(
+                f"{setting} {name}", expected=f"{point.value} to be importable", found=f"{error}"
+            ) from error
         if not callable(make):
             found = f"an object of {type(make).__name__}"
             expected = f"{point.value} to be a function of the settings, or a class"
-            raise SettingsError(f"{setting} {name}", expected, found)
+            raise SettingsError(f"{setting} {name}", expected=expected, found=found)
         return make
     installed = plugin_names(kind)
     near = nearest(name, [*built_in, *installed])
     none = "" if installed else f"no installed package adds more (entry points {GROUPS[kind]})"
     raise SettingsError(
         setting,
-        f"one of {', '.join([*built_in, *installed])}",
-        name,
+        expected=f"one of {', '.join([*built_in, *installed])}",
+        found=name,
         remedy=f"did you mean {near}?" if near else none,
     )

@@ -131,8 +131,8 @@ def _receive(connection: Connection) -> Any:
     except (EOFError, ConnectionResetError) as error:
         raise PsotrackError(
             "a worker process",
-            "a result",
-            "that the process died",
+            expected="a result",
+            found="that the process died",
             remedy="is memory short? is the call in a script outside of `if __name__ == '__main__':`? "
             "jobs=1 works without worker processes",
         ) from error

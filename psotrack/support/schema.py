@@ -79,7 +79,9 @@ def check_types(record: msgspec.Struct, prefix: str = "") -> None:
             # Records check by themselves whether a text is one of several.
             if not str(fault).startswith("Invalid enum value"):
                 expected = _expected_words(str(fault).partition(" - at ")[0])
-                raise SettingsError(f"{prefix}{field.name}", expected, _quoted(value)) from None
+                raise SettingsError(
+                    f"{prefix}{field.name}", expected=expected, found=_quoted(value)
+                ) from None
 
 
 def plain(value: Any) -> Any:
@@ -101,9 +103,11 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         # Either a TOMLDecodeError or an integer with thousands of digits.
         reason, _, place = str(error).removesuffix(")").partition(" (at ")
         where = f"{path}, {place.partition(',')[0]}" if place else path
-        raise InputError(where, "valid TOML", f"an error ({reason[:1].lower()}{reason[1:]})") from error
+        raise InputError(
+            where, expected="valid TOML", found=f"an error ({reason[:1].lower()}{reason[1:]})"
+        ) from error
     except RecursionError as error:
-        raise InputError(path, "valid TOML", "brackets in hundreds of brackets") from error
+        raise InputError(path, expected="valid TOML", found="brackets in hundreds of brackets") from error
 
 
 def read_json(path: Path | str, expected: str = "a JSON object", remedy: str = "") -> dict[str, Any]:
@@ -124,9 +128,11 @@ def read_json(path: Path | str, expected: str = "a JSON object", remedy: str = "
         found = (
             f"an error ({error})" if isinstance(error, ValueError) else "brackets in thousands of brackets"
         )
-        raise InputError(path, expected, found, remedy=remedy) from error
+        raise InputError(path, expected=expected, found=found, remedy=remedy) from error
     if not isinstance(content, dict):
-        raise InputError(path, expected, f"JSON with a {type(content).__name__}", remedy=remedy)
+        raise InputError(
+            path, expected=expected, found=f"JSON with a {type(content).__name__}", remedy=remedy
+        )
     return content
 
 
@@ -239,8 +245,8 @@ def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str,
         near = nearest(unknown, parameters) if unknown else ""
         raise SettingsError(
             name,
-            f"the arguments {', '.join(parameters)}" if parameters else "no arguments",
-            f"{unknown}" if unknown else f"{error}",
+            expected=f"the arguments {', '.join(parameters)}" if parameters else "no arguments",
+            found=f"{unknown}" if unknown else f"{error}",
             remedy=f"did you mean {near}?" if near else "",
         ) from None
 

@@ -64,7 +64,7 @@ def convert(
     import numpy as np
 
     if units is not None and units not in rig_files.UNITS_M:
-        raise SettingsError("--units", f"one of {', '.join(rig_files.UNITS_M)}", units)
+        raise SettingsError("--units", expected=f"one of {', '.join(rig_files.UNITS_M)}", found=units)
     if lenses:
         rig = rig_files.read_lenses(source, size, file_format=format)
     else:
@@ -72,7 +72,9 @@ def convert(
         rig = rig_files.read_rig(source, size, metres_per_unit=metres, file_format=format)
     if distortion is not None:
         if undistorted or lenses:
-            raise SettingsError("--distortion", "neither --undistorted nor --lenses", "one of them")
+            raise SettingsError(
+                "--distortion", expected="neither --undistorted nor --lenses", found="one of them"
+            )
         with errors_name(distortion):
             own = rig_files.read_lenses(distortion, size).select(rig.names).cameras
         # The focal length stays: it is that with which the coefficients were found.
@@ -83,7 +85,7 @@ def convert(
         # A side is a whole number of pixels.
         if (np.abs(calibrated_wh[:, 1] * size[0] / calibrated_wh[:, 0] - size[1]) >= 1).any():
             expected = f"a size of the shape of {shapes} pixels, as {source.name} states"
-            raise SettingsError("--size", expected, "{},{}".format(*size))
+            raise SettingsError("--size", expected=expected, found="{},{}".format(*size))
         rig = geometry.Rig(rig.names, geometry.scale_lens(rig.cameras, size))
         output.say(
             f"rescaled from {shapes} to {size[0]} x {size[1]} pixels: both must show the same field of view"

@@ -53,12 +53,12 @@ def fuse(
     for file in inside:
         path, name = inside_out.read_camera_path(file)
         if name in paths:
-            raise InputError(file, "the path of another drone", f"a second path of {name}")
+            raise InputError(file, expected="the path of another drone", found=f"a second path of {name}")
         paths[name] = path
     tracks = exchange.read_tracks(outside)
     if not any(path.seen.any() for path in paths.values()):
         where = ", ".join(map(str, inside))
-        raise InputError(where, "a pose in at least one frame", "none")
+        raise InputError(where, expected="a pose in at least one frame", found="none")
     if max_offset_s is None:
         _check_times(paths, tracks, outside)
     with errors_name(outside):
@@ -82,7 +82,7 @@ def _check_times(
         )
         raise InputError(
             outside,
-            f"times in common with the paths, {listed}",
-            f"{begin_s:.2f} to {end_s:.2f} s",
+            expected=f"times in common with the paths, {listed}",
+            found=f"{begin_s:.2f} to {end_s:.2f} s",
             remedy="all files must be of one recording; --max-offset SECONDS estimates the offset of a clock",
         )

@@ -115,14 +115,16 @@ def localise(
     check_suffix("--out", out, ".csv")
     output.refuse(out)
     if given.markers is None and onboard is None:
-        raise SettingsError("--markers", "a table of marker corners", "none")
+        raise SettingsError("--markers", expected="a table of marker corners", found="none")
     table = given.markers or datasets.find_marker_corners(video)
     marker_map = inside_out.read_marker_table(table)
     centres_only = not isinstance(marker_map, inside_out.MarkerMap)
     if given.side_m is not None:
         check_positive("--marker-size", given.side_m)
         if not centres_only:
-            raise SettingsError("--marker-size", "a table of centres alone", f"corners in {table}")
+            raise SettingsError(
+                "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
+            )
     lens = lenses.of(source.image_size_wh, K=None if onboard is None else onboard.K)
     name, source = source.name, source.first(num_frames)
     rows = source.image_size_wh[1]
@@ -162,21 +164,23 @@ def _input(
     stream, folder = given.live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
     if video.isdecimal() and not stream and not folder.exists():
-        raise InputError(video, "a video", "no such file", remedy="pass --live if it is a camera's number")
+        raise InputError(
+            video, expected="a video", found="no such file", remedy="pass --live if it is a camera's number"
+        )
     has_images = of_folder and recordings.is_picture_folder(folder)
     if of_folder and datasets.read_onboard(folder):
         chosen = onboard_videos(folder, None if given.drone is None else (given.drone,))
         if len(chosen) > 1:
-            raise SettingsError("--drone", f"one of {', '.join(chosen)}", "none")
+            raise SettingsError("--drone", expected=f"one of {', '.join(chosen)}", found="none")
         ((drone, onboard),) = chosen.items()
         return inside_out.open_source(onboard.video.path, fps=given.fps), given.name or drone, onboard
     if given.drone is not None:
-        raise SettingsError("--drone", "a folder with videos of drones' own cameras", video)
+        raise SettingsError("--drone", expected="a folder with videos of drones' own cameras", found=video)
     if of_folder and not has_images:
         raise InputError(
             folder,
-            f"images, which end in {', '.join(recordings.IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
-            "neither",
+            expected=f"images, which end in {', '.join(recordings.IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
+            found="neither",
             remedy="to use a video in a folder, name the video itself",
         )
     name = "camera" if stream else folder.name if of_folder else folder.stem
@@ -190,7 +194,7 @@ def _shutter(readout_s: float | None, rows: int, fps: float | None) -> inside_ou
     longest_s = 1.0 if fps is None else 1 / fps
     if not 0 <= readout_s <= longest_s * (1 + 1e-9):
         of_frame = "" if fps is None else f", the time between two frames at {fps:g} frames per second"
-        raise SettingsError("--readout", f"0 to {longest_s:.3g} s{of_frame}", f"{readout_s:g}")
+        raise SettingsError("--readout", expected=f"0 to {longest_s:.3g} s{of_frame}", found=f"{readout_s:g}")
     return inside_out.RollingShutter(readout_s / rows)
 
 

@@ -70,7 +70,7 @@ def detect_markers(
         )
     else:
         if num_frames is not None:
-            raise SettingsError("--frames", "a video", "images")
+            raise SettingsError("--frames", expected="a video", found="images")
         names, what = _names(photographs), "images"
         found = list(inside_out.markers_of_images(photographs, dictionary, output.report))
     inside_out.write_marker_table(out, found, names, force=output.force)
@@ -98,7 +98,7 @@ def _photographs(images: tuple[Path, ...]) -> list[Path] | None:
             inside = recordings.image_files(path)
             if not inside:
                 expected = f"images, which end in {', '.join(recordings.IMAGE_SUFFIXES)}"
-                raise InputError(path, expected, "none in this folder")
+                raise InputError(path, expected=expected, found="none in this folder")
             paths += inside
         elif recordings.is_image(path) or not path.exists():
             paths.append(path)
@@ -107,8 +107,8 @@ def _photographs(images: tuple[Path, ...]) -> list[Path] | None:
         else:
             raise InputError(
                 path,
-                "an image or a folder of images",
-                "another file",
+                expected="an image or a folder of images",
+                found="another file",
                 remedy="a video needs a call of its own",
             )
     return paths
@@ -196,7 +196,7 @@ def map_markers(
         check: check the table MAP instead of writing one.
     """
     if out is not None and check is not None:
-        raise SettingsError("onboard map", "--out FILE or --check MAP", "both")
+        raise SettingsError("onboard map", expected="--out FILE or --check MAP", found="both")
     if check is None:
         out = out or Path("aruco_corners.csv")
         check_suffix("--out", out, ".csv")
@@ -205,7 +205,9 @@ def map_markers(
         check_positive("--side", world.side_m)
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
-            raise SettingsError("SOURCE", "one file of measured corners", f"{len(sources)} files")
+            raise SettingsError(
+                "SOURCE", expected="one file of measured corners", found=f"{len(sources)} files"
+            )
         measured = inside_out.fit_squares(inside_out.read_measured_corners(sources[0]), side_m=world.side_m)
         datasets.write_marker_corners(out, measured.marker_map.corners_m, measured.marker_map.std_m)
         show_measured(output, measured, out)

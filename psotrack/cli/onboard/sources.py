@@ -29,7 +29,7 @@ def known_corners(
     ids = list(dict.fromkeys(number for number in numbers if number is not None))
     if not numbers or None in numbers:
         expected = "numbers of markers that are known, such as 7 or 7,12"
-        raise SettingsError("--known", expected, known or "none")
+        raise SettingsError("--known", expected=expected, found=known or "none")
     if table is None and side_m is None and datasets.is_recording(sources[0]):
         table = datasets.find_marker_corners(sources[0])
     if table is not None:
@@ -37,11 +37,13 @@ def known_corners(
         missing = [marker for marker in ids if marker not in marker_map]
         if missing:
             found = f"only {', '.join(map(str, marker_map.ids.tolist()))}"
-            raise InputError(table, f"the known marker {missing[0]}", found)
+            raise InputError(table, expected=f"the known marker {missing[0]}", found=found)
         return {marker: marker_map.corners_m[marker] for marker in ids}
     if side_m is None or len(ids) > 1:
         expected = "--markers with the corners of the known markers, or --side and one known marker"
-        raise SettingsError("--known", expected, "no --markers" if side_m is not None else "neither")
+        raise SettingsError(
+            "--known", expected=expected, found="no --markers" if side_m is not None else "neither"
+        )
     return {ids[0]: inside_out.corners_in_own_frame(side_m)}
 
 
@@ -70,7 +72,7 @@ class OnboardLensOptions:
         names: tuple[str | None, ...] = self.names or (None,)
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
-            raise SettingsError("--camera-name", expected, f"{len(names)}")
+            raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
         name = names[index % len(names)]
         return inside_out.choose_lens(
             size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale
@@ -90,14 +92,14 @@ def videos_of(
     """Videos with their lenses, by name; a folder of pictures is a video of `fps` frames per second."""
     if datasets.is_recording(sources[0]):
         if len(sources) > 1:
-            raise SettingsError("SOURCE", "one sequence, or videos", f"{len(sources)} sources")
+            raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} sources")
         onboard = onboard_videos(sources[0], drones)
         return {
             name: (one.video, lenses.of(one.video.image_size_wh, index, len(onboard), one.K))
             for index, (name, one) in enumerate(onboard.items())
         }
     if drones is not None:
-        raise SettingsError("--drone", "a sequence's folder as SOURCE", f"{sources[0]}")
+        raise SettingsError("--drone", expected="a sequence's folder as SOURCE", found=f"{sources[0]}")
     rates = [fps or (PICTURES_FPS if recordings.is_picture_folder(path) else None) for path in sources]
     infos = [recordings.open_video(path, rate) for path, rate in zip(sources, rates, strict=True)]
     return {
@@ -110,10 +112,12 @@ def onboard_videos(folder: Path, names: tuple[str, ...] | None) -> dict[str, rec
     """Videos of the cameras on a sequence's drones, by name: all of them, or those of some names."""
     onboard = datasets.read_onboard(folder)
     if not onboard:
-        raise InputError(folder, "videos of drones' own cameras, such as dron1_cam_s.avi", "none")
+        raise InputError(
+            folder, expected="videos of drones' own cameras, such as dron1_cam_s.avi", found="none"
+        )
     unknown = [name for name in names or () if name not in onboard]
     if unknown:
-        raise SettingsError("--drone", f"names among {', '.join(onboard)}", ", ".join(unknown))
+        raise SettingsError("--drone", expected=f"names among {', '.join(onboard)}", found=", ".join(unknown))
     return {name: onboard[name] for name in names or onboard}
 
 
@@ -123,5 +127,5 @@ def leading(video: recordings.VideoInfo, num_frames: int | None) -> recordings.V
         return video
     if not 0 < num_frames <= video.num_frames:
         expected = f"1 to {video.num_frames}, the frames of {video.path}"
-        raise SettingsError("--frames", expected, f"{num_frames}")
+        raise SettingsError("--frames", expected=expected, found=f"{num_frames}")
     return replace(video, num_frames=num_frames)

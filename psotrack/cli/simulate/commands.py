@@ -77,15 +77,15 @@ def sequence(
     if (name is None) == (scenario is None):
         raise SettingsError(
             "simulate",
-            "the NAME of a scenario or --scenario FILE.toml",
-            "neither" if name is None else "both",
+            expected="the NAME of a scenario or --scenario FILE.toml",
+            found="neither" if name is None else "both",
             remedy="psotrack simulate --list shows the names",
         )
     if show:
         given = [*changes, *["--restless"] * restless]
         if name is None or given:
             expected = "the NAME of a scenario, whose file is shown as it is"
-            raise SettingsError("--show", expected, ", ".join(given) or "none")
+            raise SettingsError("--show", expected=expected, found=", ".join(given) or "none")
         click.echo(simulation.preset_text(name), nl=False)
         return
     recipe = simulation.load(scenario) if scenario else simulation.scenario(str(name))
@@ -102,7 +102,7 @@ def _change(text: str) -> tuple[str, Any]:
     """Field and value of `FIELD=VALUE`; the value is parsed as TOML, and kept as text if it is not valid TOML."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise SettingsError("--set", "FIELD=VALUE, such as imaging.shutter_s=0.01", text)
+        raise SettingsError("--set", expected="FIELD=VALUE, such as imaging.shutter_s=0.01", found=text)
     try:
         return name.strip(), tomllib.loads(f"value = {value}")["value"]
     except ValueError:

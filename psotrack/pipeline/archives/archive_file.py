@@ -126,12 +126,12 @@ def read_manifest(folder: Path) -> Manifest:
     data = read_json(path, "the manifest of an archive of psotrack")
     version = data.get("version")
     if data.get("format") != FORMAT:
-        raise InputError(path, "the manifest of an archive of psotrack", "another JSON file")
+        raise InputError(path, expected="the manifest of an archive of psotrack", found="another JSON file")
     if isinstance(version, int) and version > FORMAT_VERSION:
         raise InputError(
             path,
-            f"an archive of version {FORMAT_VERSION} or older",
-            f"version {version}, written by psotrack {data.get('psotrack', 'of an unknown version')}",
+            expected=f"an archive of version {FORMAT_VERSION} or older",
+            found=f"version {version}, written by psotrack {data.get('psotrack', 'of an unknown version')}",
             remedy="install a newer psotrack",
         )
     return _converted(path, data, Manifest, "a whole manifest")
@@ -145,7 +145,7 @@ def read_record(tracks: Path) -> TrackRecord:
     """
     path, expected = tracks.with_suffix(".json"), "the record of the tracks, which `track` writes"
     if not path.is_file():
-        raise InputError(path, expected, "no such file")
+        raise InputError(path, expected=expected, found="no such file")
     return _converted(path, read_json(path, expected), TrackRecord, expected, "track again")
 
 
@@ -155,7 +155,7 @@ def _converted(
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise InputError(path, expected, f"{error}", remedy=remedy) from error
+        raise InputError(path, expected=expected, found=f"{error}", remedy=remedy) from error
 
 
 #: What becomes a file of an archive: a file, or its content.
@@ -192,7 +192,7 @@ def write_archive(
     _check_names(path, list(files))
     for source in files.values():
         if isinstance(source, Path) and not os.access(source, os.R_OK):
-            raise InputError(source, "a file that can be read", "none")
+            raise InputError(source, expected="a file that can be read", found="none")
     manifest = msgspec.structs.replace(manifest, files=tuple(files))
     content = msgspec.json.format(msgspec.json.encode(manifest, order="deterministic"), indent=1)
     with (
@@ -236,8 +236,8 @@ def unpack(
     if folder.exists() and not (folder / MANIFEST_FILE).is_file():
         raise OutputError(
             folder,
-            "a folder into which an archive was unpacked",
-            "another folder or file",
+            expected="a folder into which an archive was unpacked",
+            found="another folder or file",
             remedy="name a path that does not exist yet",
         )
     with _opened(archive) as zipped, atomic_write(folder) as temporary:
@@ -280,8 +280,8 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
 def _damaged(path: Path, error: Exception) -> InputError:
     return InputError(
         path,
-        "a whole archive of psotrack",
-        f"another file, or one that was cut short or changed ({error})",
+        expected="a whole archive of psotrack",
+        found=f"another file, or one that was cut short or changed ({error})",
         remedy="copy it again, or pack it again",
     )
 
@@ -298,7 +298,7 @@ def _manifest_of(archive: Path, folder: Path, zipped: zipfile.ZipFile) -> Manife
     different |= {manifest.tracks, manifest.record} - set(manifest.files)
     if different:
         expected, name = f"the files that {MANIFEST_FILE} lists", min(different)
-        raise InputError(archive, expected, f"a difference: {name}")
+        raise InputError(archive, expected=expected, found=f"a difference: {name}")
     return manifest
 
 
@@ -320,10 +320,10 @@ def _check_names(path: Path, names: list[str]) -> None:
         is_inside = all(part not in ("", ".", "..") for part in name.split("/"))
         if not is_inside or not name.isprintable() or any(mark in name for mark in "\\:"):
             expected = "names of files inside of the folder"
-            raise InputError(path, expected, f"{name!r}", remedy="do not trust it")
+            raise InputError(path, expected=expected, found=f"{name!r}", remedy="do not trust it")
         # Two names that differ in case only are one file on some systems.
         if name.casefold() in seen:
-            raise InputError(path, "each file once", f"{name} twice")
+            raise InputError(path, expected="each file once", found=f"{name} twice")
         seen.add(name.casefold())
 
 
@@ -332,4 +332,4 @@ def _check_ratio(path: Path, size: int) -> None:
     most = max(_SMALL, _MOST_RATIO * path.stat().st_size)
     if size > most:
         expected = f"files of at most {most} bytes in an archive of {path.stat().st_size}"
-        raise InputError(path, expected, f"{size} bytes", remedy="do not trust it")
+        raise InputError(path, expected=expected, found=f"{size} bytes", remedy="do not trust it")

@@ -222,7 +222,7 @@ def _recording_of(tracks: Path, record: TrackRecord, opened: Recording) -> Recor
     rows = read_trajectories(tracks).num_frames
     if not record.causal and rows != record.frames:
         expected = f"{record.frames} frames, as {tracks.with_suffix('.json').name} says"
-        raise InputError(tracks, expected, f"{rows}")
+        raise InputError(tracks, expected=expected, found=f"{rows}")
     for name in record.cameras:
         if name not in opened.rig.names:
             raise _other_recording(tracks, record, opened, f"no camera {name}")
@@ -239,8 +239,8 @@ def _recording_of(tracks: Path, record: TrackRecord, opened: Recording) -> Recor
 def _other_recording(tracks: Path, record: TrackRecord, opened: Recording, has: str) -> InputError:
     return InputError(
         tracks,
-        f"tracks of {opened.folder}",
-        f"tracks of {record.sequence} with {len(record.cameras)} cameras and {record.frames} frames at "
+        expected=f"tracks of {opened.folder}",
+        found=f"tracks of {record.sequence} with {len(record.cameras)} cameras and {record.frames} frames at "
         f"{record.rate_hz:g} Hz, while {opened.name} has {has}",
         remedy="name the recording that was tracked, or track again with this version",
     )

@@ -205,7 +205,7 @@ def find_marker_corners(path: Path | str) -> Path:
         return path / MARKER_CORNERS
     markers = read_recording_file(file).markers
     if markers is None:
-        raise InputError(f"{file}, markers.corners", "a table of marker corners", "none")
+        raise InputError(f"{file}, markers.corners", expected="a table of marker corners", found="none")
     return file.parent / markers.corners
 
 
@@ -213,21 +213,21 @@ def _no_recording(path: Path) -> InputError:
     expected = f"a {RECORDING_FILE}, a folder that holds one, or a folder of the DPJAIT dataset"
     if path.suffix.lower() == ARCHIVE_SUFFIX and path.is_file():
         remedy = f"`psotrack archive {shlex.quote(f'{path}')} --out FOLDER` makes such a folder"
-        return InputError(path, expected, "an archive", remedy=remedy)
+        return InputError(path, expected=expected, found="an archive", remedy=remedy)
     if path.suffix.lower() == ".zip" and path.is_file():
-        return InputError(path, expected, "an archive", remedy="unpack it first")
+        return InputError(path, expected=expected, found="an archive", remedy="unpack it first")
     if not path.exists():
-        return InputError(path, expected, "nothing")
+        return InputError(path, expected=expected, found="nothing")
     if not path.is_dir():
-        return InputError(path, expected, "another file")
+        return InputError(path, expected=expected, found="another file")
     try:
         names = (RECORDING_FILE, CALIBRATION)
         below = sorted(inner for inner in path.iterdir() if any((inner / name).is_file() for name in names))
     except OSError:
-        return InputError(path, expected, "a folder without read permission")
+        return InputError(path, expected=expected, found="a folder without read permission")
     found, remedy = (
         f"neither {RECORDING_FILE} nor {CALIBRATION}",
         f"did you mean {below[0]}?" if below else "",
     )
     remedy = remedy or f"`psotrack init {path}` writes a {RECORDING_FILE} for your own videos"
-    return InputError(path, expected, found, remedy=remedy)
+    return InputError(path, expected=expected, found=found, remedy=remedy)

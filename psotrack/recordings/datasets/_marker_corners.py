@@ -179,8 +179,8 @@ def _rows_per_corner(table: Table) -> dict[int, MarkerRow]:
         if missing:
             raise InputError(
                 f"{where}, marker {marker}",
-                "4 corners",
-                f"none of number {', '.join(missing)}",
+                expected="4 corners",
+                found=f"none of number {', '.join(missing)}",
                 remedy="add it, or leave the marker out",
             )
         found[marker] = MarkerRow(where, np.array([point_m(of_marker[corner]) for corner in range(1, 5)]))
@@ -199,18 +199,18 @@ def _read_normalised(path: Path) -> Table:
     line = first_line(path)
     rows = read_rows(path, next((mark for mark in ";\t" if mark in line), ","))
     if not rows:
-        raise InputError(path, "a table of marker corners", "an empty file")
+        raise InputError(path, expected="a table of marker corners", found="an empty file")
     header = rows[0]
     if are_numbers([*header.cells]):
         if len(header.cells) not in _UNNAMED:
             expected = "a header, or numbers in rows of 13 (id, 4 corners) or 5 (id, corner, x, y, z)"
-            raise InputError(header.where, expected, f"{len(header.cells)} numbers")
+            raise InputError(header.where, expected=expected, found=f"{len(header.cells)} numbers")
         names = _UNNAMED[len(header.cells)]
         columns = tuple(Column(index, name, "", name) for index, name in enumerate(names))
     else:
         columns, rows = _columns(header), rows[1:]
     if not rows:
-        raise InputError(path, "rows below the header", "none")
+        raise InputError(path, expected="rows below the header", found="none")
     return Table(path, columns, tuple(_with_last_cell(row, len(columns)) for row in rows))
 
 
@@ -219,7 +219,7 @@ def _with_last_cell(row: TextRow, count: int) -> TextRow:
     cells = row.cells + ("",) * (len(row.cells) == count - 1)
     if len(cells) != count:
         remedy = "a marker has four corners of three coordinates" if count >= 13 else ""
-        raise InputError(row.where, f"{count} values", f"{len(row.cells)}", remedy=remedy)
+        raise InputError(row.where, expected=f"{count} values", found=f"{len(row.cells)}", remedy=remedy)
     return replace(row, cells=cells)
 
 
@@ -238,7 +238,7 @@ def _columns(header: TextRow) -> tuple[Column, ...]:
     known = {"id", "corner", *"xyz", *_CORNERS}
     twice = [column.header for column in columns if names.count(column.name) > 1 and column.name in known]
     if twice:
-        raise InputError(header.where, "each column once", f"{' and '.join(twice)}")
+        raise InputError(header.where, expected="each column once", found=f"{' and '.join(twice)}")
     return tuple(columns)
 
 

@@ -105,13 +105,13 @@ def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orien
     if len(position_m) != len(orientation_wxyz) or len(position_m) == 0:
         raise SettingsError(
             "poses",
-            "equal numbers of positions and orientations, at least one",
-            f"{len(position_m)} positions and {len(orientation_wxyz)} orientations",
+            expected="equal numbers of positions and orientations, at least one",
+            found=f"{len(position_m)} positions and {len(orientation_wxyz)} orientations",
         )
     poses = np.hstack([position_m, _euler_rad(orientation_wxyz), orientation_wxyz])
     if not np.isfinite(poses[1:]).all():
         frame = int(np.argmin(np.isfinite(poses[1:]).all(axis=1))) + 1
-        raise SettingsError("poses", "finite numbers", f"NaN or infinity at frame {frame}")
+        raise SettingsError("poses", expected="finite numbers", found=f"NaN or infinity at frame {frame}")
     header = [
         "id",
         *(f"pos_{axis}[m]" for axis in "xyz"),
@@ -246,13 +246,17 @@ def _read_files(paths: Sequence[Path], fps: float, bodies: Bodies | None) -> lis
     recorded = [path for path in paths if path.suffix.lower() == ".c3d"]
     if bodies and len(recorded) != 1:
         found_files = ", ".join(path.name for path in recorded) or "none"
-        raise InputError(f"bodies {', '.join(bodies)}", "one C3D file that holds their markers", found_files)
+        raise InputError(
+            f"bodies {', '.join(bodies)}", expected="one C3D file that holds their markers", found=found_files
+        )
     found = [_read(path, fps, bodies) for path in paths]
     places: dict[str, Path] = {}
     for path, reference in zip(paths, found, strict=True):
         for drone in reference.drones:
             if drone in places:
-                raise InputError(path, "one file per drone", f"{drone} in {places[drone]} as well")
+                raise InputError(
+                    path, expected="one file per drone", found=f"{drone} in {places[drone]} as well"
+                )
             places[drone] = path
     return found
 
@@ -286,7 +290,7 @@ def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
         return read_trajectories(path, fps=fps)
     if suffix == ".csv":
         return _read_pose_file(path, fps)
-    raise InputError(path, f"a file that ends in {', '.join(_SUFFIXES)}", path.name)
+    raise InputError(path, expected=f"a file that ends in {', '.join(_SUFFIXES)}", found=path.name)
 
 
 def _read_pose_file(path: Path, fps: float) -> Trajectories:

@@ -84,8 +84,8 @@ def read_onboard(folder: Path | str) -> dict[str, OnboardVideo]:
         if size_wh != video.image_size_wh:
             raise InputError(
                 path,
-                f"{size_wh[0]} x {size_wh[1]} pixels as {name} has in {ONBOARD_CALIBRATION}",
-                f"{video.image_size_wh[0]} x {video.image_size_wh[1]}",
+                expected=f"{size_wh[0]} x {size_wh[1]} pixels as {name} has in {ONBOARD_CALIBRATION}",
+                found=f"{video.image_size_wh[0]} x {video.image_size_wh[1]}",
             )
         position_m = np.full((video.num_frames, 3), np.nan)
         orientation_wxyz = np.full((video.num_frames, 4), np.nan)
@@ -130,7 +130,7 @@ def write_onboard_calibration(path: Path | str, intrinsics: Intrinsics) -> None:
     """
     if not intrinsics or any(K[0, 1] for K, _ in intrinsics.values()):
         found = "a camera with skew" if intrinsics else "no camera"
-        raise SettingsError("intrinsics", "at least one camera, all without skew", found)
+        raise SettingsError("intrinsics", expected="at least one camera, all without skew", found=found)
     header = ["cam_name", "focal_length_x", "focal_length_y", "cx", "cy", *_SIZES]
     rows = [[name, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size_wh] for name, (K, size_wh) in intrinsics.items()]
     write_rows(path, [header, *rows])
@@ -145,9 +145,9 @@ def _numbered(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int, Path
             continue
         number = whole_number(match["number"])
         if number is None:
-            raise InputError(path, "the number of a drone in the name", match["number"])
+            raise InputError(path, expected="the number of a drone in the name", found=match["number"])
         if number in found:
-            raise InputError(path, "one file per drone", f"{found[number].name} as well")
+            raise InputError(path, expected="one file per drone", found=f"{found[number].name} as well")
         found[number] = path
     return dict(sorted(found.items()))
 
@@ -157,7 +157,7 @@ def _check_rate(path: Path, fps: float) -> None:
     match = _POSES.fullmatch(path.name)
     # 0.1 % is the accuracy of rates in containers; a larger difference would drift.
     if match is not None and abs(float(match["rate"]) - fps) > 1e-3 * fps:
-        raise InputError(path, f"poses at the {fps:g} Hz of the video", f"{match['rate']} Hz")
+        raise InputError(path, expected=f"poses at the {fps:g} Hz of the video", found=f"{match['rate']} Hz")
 
 
 CALIBRATION = "cameras_calibration.csv"
@@ -195,7 +195,7 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     _check_principal_points(rig, videos)
     boxes = folder / DETECTIONS
     if boxes.exists() and not boxes.is_dir():
-        raise InputError(boxes, "a folder of detections, or none", "a file")
+        raise InputError(boxes, expected="a folder of detections, or none", found="a file")
     detections = files_by_camera(boxes.glob("*.csv"), names)
     times = _frame_times(videos, detections)
     corners = folder / MARKER_CORNERS
@@ -235,8 +235,8 @@ def detection_files(folder: Path | str, cameras: Sequence[str]) -> dict[str, Pat
     if not found:
         raise InputError(
             folder,
-            f"a folder with files named like the cameras, {cameras[0]}.csv ...",
-            "no such file" if folder.is_dir() else "no such folder",
+            expected=f"a folder with files named like the cameras, {cameras[0]}.csv ...",
+            found="no such file" if folder.is_dir() else "no such folder",
         )
     return found
 
@@ -256,8 +256,8 @@ def _videos(folder: Path, files: Sequence[Path], names: Sequence[str]) -> dict[s
     if not found:
         raise InputError(
             folder,
-            f"videos named like the cameras, {names[0]}.avi ...",
-            ", ".join(path.name for path in candidates) or "no .avi or .mp4 at all",
+            expected=f"videos named like the cameras, {names[0]}.avi ...",
+            found=", ".join(path.name for path in candidates) or "no .avi or .mp4 at all",
         )
     for path in candidates:
         if path not in found.values():
@@ -298,8 +298,8 @@ def _check_principal_points(rig: Rig, videos: Mapping[str, VideoInfo]) -> None:
         if max(abs(x / width - 0.5), abs(y / height - 0.5)) > _OFF_CENTRE:
             raise InputError(
                 video.path,
-                f"images with their middle near the principal point ({x:g}, {y:g})",
-                f"{width} x {height} pixels",
+                expected=f"images with their middle near the principal point ({x:g}, {y:g})",
+                found=f"{width} x {height} pixels",
                 remedy="is it the video of another camera?",
             )
 

@@ -173,7 +173,7 @@ class Matching:
         remedy = f"say whose it is with --match CAMERA={first}, or leave it out with --leave-out {first}"
         if others:
             remedy += f"; the same for {', '.join(others)}"
-        return InputError(path, expected, found, remedy=remedy)
+        return InputError(path, expected=expected, found=found, remedy=remedy)
 
 
 def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions | None = None) -> Draft:
@@ -206,7 +206,7 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         raise _nothing(matching)
     references = [_written(each.path, out.parent) for each in found if each.kind == "reference"]
     if options.bodies and not references:
-        raise SettingsError("--body", f"a C3D file in {folder}", "none")
+        raise SettingsError("--body", expected=f"a C3D file in {folder}", found="none")
     content = RecordingFile(
         version=1,
         calibration=None if calibration is None else _written(calibration, out.parent),
@@ -249,11 +249,13 @@ def _check_by_hand(folder: Path, options: DraftOptions) -> None:
     """Raise `SettingsError` for a file that is left out but does not exist, and for a file that is matched twice."""
     for name in options.leave_out:
         if not (folder / name).exists():
-            raise SettingsError("--leave-out", f"a file in {folder}", name)
+            raise SettingsError("--leave-out", expected=f"a file in {folder}", found=name)
     files = [file for _, file in options.match]
     for file in files:
         if files.count(file) > 1:
-            raise SettingsError("--match", "each file once", f"{file} {files.count(file)} times")
+            raise SettingsError(
+                "--match", expected="each file once", found=f"{file} {files.count(file)} times"
+            )
 
 
 def _without(folder: Path, found: list[Found], names: Sequence[str]) -> list[Found]:
@@ -268,8 +270,8 @@ def _calibration_of(folder: Path, found: Sequence[Found]) -> Path | None:
     if len(paths) > 1:
         raise InputError(
             folder,
-            "one rig file",
-            ", ".join(path.name for path in paths),
+            expected="one rig file",
+            found=", ".join(path.name for path in paths),
             remedy="name the one to use with --calibration FILE",
         )
     return paths[0] if paths else None
@@ -279,7 +281,9 @@ def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tupl
     """Sizes of the cameras of a rig file by name, None where it states none."""
     if calibration is None:
         if unit is not None:
-            raise SettingsError("--units", "a rig file, in the folder or by --calibration", "none")
+            raise SettingsError(
+                "--units", expected="a rig file, in the folder or by --calibration", found="none"
+            )
         return {}
     return {name: fields.size_wh for name, fields in read_cameras(calibration).items()}
 
@@ -316,7 +320,7 @@ def _put_by_hand(matching: Matching, name: str, file: str) -> None:
     else:
         matching.put(camera, kind, file if "://" in file else path)
         return
-    raise SettingsError("--match", expected, found)
+    raise SettingsError("--match", expected=expected, found=found)
 
 
 def _match(matching: Matching, left_out: Collection[Path]) -> None:
@@ -375,12 +379,12 @@ def _table(matching: Matching, name: str, base: Path, options: DraftOptions) -> 
         fps = options.fps
         if fps is None:
             expected = f"frames per second of camera {name}, which has no video"
-            raise InputError(matching.folder, expected, "none", remedy="pass --fps")
+            raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
     if not isinstance(video, Path):
         size = options.size_wh or matching.known.get(name)
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
-            raise InputError(matching.folder, expected, "none", remedy="pass --size")
+            raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
     written: dict[str, Any] = {kind: _written(file, base) for kind, file in files.items()}
     return CameraTable(size=size, fps=fps, **written)
 
@@ -405,4 +409,4 @@ def _nothing(matching: Matching) -> InputError:
         remedy = "say which file is whose with --match CAMERA=FILE"
     if below is not None:
         remedy = f"for the videos in {below.name}: psotrack init {shlex.quote(str(below))}{given}"
-    return InputError(folder, expected, "none", remedy=remedy)
+    return InputError(folder, expected=expected, found="none", remedy=remedy)

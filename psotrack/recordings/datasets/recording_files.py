@@ -164,7 +164,7 @@ class _Named:
             height, width = read_mask(ignore).shape
             if size_wh not in (None, (width, height)):
                 expected = f"{_size_text(size_wh)} as camera {self.name}"
-                raise InputError(ignore, expected, _size_text((width, height)))
+                raise InputError(ignore, expected=expected, found=_size_text((width, height)))
         if size_wh is not None and times is not None:
             # The rows of an image cannot take longer than the time from frame to frame.
             longest_s = 1 / (times.fps * size_wh[1])
@@ -255,7 +255,7 @@ class _Named:
             num_frames, where = int(read_detections(detections).frame.max(initial=-1)) + 1, f"{detections}"
         assert table.fps is not None, "the schema asks for fps of a camera without video"
         if num_frames > MOST_INSTANTS:
-            raise InputError(where, f"at most {MOST_INSTANTS} frames", f"{num_frames}")
+            raise InputError(where, expected=f"at most {MOST_INSTANTS} frames", found=f"{num_frames}")
         return FrameTimes(num_frames, table.fps, offset_s)
 
 
@@ -267,7 +267,7 @@ def _listed_times(file: Path, video: VideoInfo | None, silhouettes: StoredSilhou
     if video is None and silhouettes is not None:
         if times.num_frames < silhouettes.num_frames:
             expected = f"times of the {silhouettes.num_frames} frames of the silhouettes"
-            raise InputError(file, expected, f"{times.num_frames}")
+            raise InputError(file, expected=expected, found=f"{times.num_frames}")
         return times.cut(silhouettes.num_frames)
     return times
 
@@ -301,8 +301,8 @@ def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
     if abs(video.fps / times.fps / 1000 - 1) < _SLIP_SHARE:
         raise InputError(
             file,
-            f"times in seconds, of about {video.fps:g} frames per second as in {video.path.name}",
-            f"{times.fps:g} frames per second",
+            expected=f"times in seconds, of about {video.fps:g} frames per second as in {video.path.name}",
+            found=f"{times.fps:g} frames per second",
             remedy="divide the times by 1000 if they are milliseconds",
         )
 

@@ -93,7 +93,9 @@ def _times(file: Path, count: int, recording: Recording | None) -> Float[np.ndar
         read = read_numbers(beside, 1, "one time in seconds per line")
         time_s = read.values[:, 0]
         if len(time_s) != count:
-            raise InputError(beside, f"{count} times, as many as {file.name} has poses", f"{len(time_s)}")
+            raise InputError(
+                beside, expected=f"{count} times, as many as {file.name} has poses", found=f"{len(time_s)}"
+            )
         if (row := first_repeat(time_s)) is not None:
             raise read.error(
                 row, expected="times that increase from line to line", found=f"{time_s[row]:g} s"
@@ -101,14 +103,17 @@ def _times(file: Path, count: int, recording: Recording | None) -> Float[np.ndar
         return time_s
     if recording is None:
         raise InputError(
-            file, f"a file of times, {SEQUENCES}/{file.stem}/{TIMES}", "none", remedy="name SEQ, too"
+            file,
+            expected=f"a file of times, {SEQUENCES}/{file.stem}/{TIMES}",
+            found="none",
+            remedy="name SEQ, too",
         )
     instant_s = recording.timeline().time_s
     if len(instant_s) != count:
         raise InputError(
             file,
-            f"{len(instant_s)} poses, one for each instant of the recording, or a file of times",
-            f"{count} poses",
+            expected=f"{len(instant_s)} poses, one for each instant of the recording, or a file of times",
+            found=f"{count} poses",
         )
     return instant_s
 
@@ -163,8 +168,8 @@ def _write_folder(folder: Path, trajectories: Trajectories, footage: Footage, re
     if size_m is None:
         raise SettingsError(
             "--drone-size",
-            "the drones' size, for boxes in the cameras",
-            "none, and no record beside the tracks that has it",
+            expected="the drones' size, for boxes in the cameras",
+            found="none, and no record beside the tracks that has it",
             remedy="name it, or leave out SEQ to write positions alone",
         )
     truth = _reference(recording, trajectories)
@@ -212,7 +217,7 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
     if (read.values[:, 7:] == -1).all():
         found = "boxes alone: x, y and z are -1 in every row"
         remedy = "name a file with 3D columns, or the folder that `psotrack export --to mot` wrote"
-        raise InputError(path, "positions in MOT15's 3D columns", found, remedy=remedy)
+        raise InputError(path, expected="positions in MOT15's 3D columns", found=found, remedy=remedy)
     # Drones have the order of their first rows: here that of their numbers.
     order = np.argsort(number[:, 1], kind="stable")
     frame, identity = number[order, 0] - 1, number[order, 1].astype(int)
@@ -237,15 +242,17 @@ def _times_of_rows(
             parser.read(info, encoding="utf-8")
             fps = float(parser["Sequence"]["frameRate"])
         except (configparser.Error, KeyError, ValueError) as error:
-            raise InputError(info, "a frameRate", f"{error}".partition("\n")[0]) from error
+            raise InputError(info, expected="a frameRate", found=f"{error}".partition("\n")[0]) from error
         if not _SLOWEST_HZ < fps < np.inf:
-            raise InputError(info, f"a frameRate above {_SLOWEST_HZ:g}", f"{fps:g}")
+            raise InputError(info, expected=f"a frameRate above {_SLOWEST_HZ:g}", found=f"{fps:g}")
     if recording is not None and (fps is None or abs(fps / recording.fps - 1) < 1e-3):
         time_s = recording.timeline().time_s
         instant = np.minimum(frame, len(time_s) - 1).astype(int)
         return np.where(frame < len(time_s), time_s[instant], frame / recording.fps)
     if fps is None:
-        raise InputError(path, f"a rate, in {INFO} beside the file", "none", remedy="name SEQ, too")
+        raise InputError(
+            path, expected=f"a rate, in {INFO} beside the file", found="none", remedy="name SEQ, too"
+        )
     return frame / fps
 
 

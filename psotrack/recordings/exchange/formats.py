@@ -55,7 +55,7 @@ def write_c3d_tracks(path: Path, trajectories: Trajectories, footage: Footage | 
         OutputError: the file cannot be written.
     """
     if not trajectories.seen.any():
-        raise InputError("tracks", "a drone that is seen in some frame", "none")
+        raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
     frames = int(trajectories.frame[-1]) + 1
     position_m = np.full((frames, trajectories.num_drones, 3), np.nan)
     position_m[trajectories.frame] = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
@@ -71,7 +71,7 @@ def read_c3d_tracks(path: Path, recording: Recording | None) -> Trajectories:
     markers = read_c3d(path)
     labels = [label for label in markers.labels if markers.labels.count(label) > 1]
     if labels:
-        raise InputError(path, "points with different labels", f"{labels[0]} twice")
+        raise InputError(path, expected="points with different labels", found=f"{labels[0]} twice")
     frame = markers.frame
     read = Trajectories(frame, frame / markers.rate_hz, markers.labels, markers.position_m)
     if recording is None or abs(markers.rate_hz / recording.fps - 1) > _ONE_RATE:
@@ -165,13 +165,13 @@ def read_tracks(path: Path | str, *, recording: Recording | None = None) -> Traj
     """
     path = Path(path)
     if not path.exists():
-        raise InputError(path, "a file or folder of tracks", "no such file or folder")
+        raise InputError(path, expected="a file or folder of tracks", found="no such file or folder")
     check_kind(path, "tracks")
     read = _read_folder if path.is_dir() else _READERS.get(path.suffix.lower())
     if read is None:
-        raise InputError(path, _KINDS, repr(path.name))
+        raise InputError(path, expected=_KINDS, found=repr(path.name))
     if path.is_file() and path.stat().st_size == 0:
-        raise InputError(path, "tracks", "an empty file")
+        raise InputError(path, expected="tracks", found="an empty file")
     with errors_name(path):
         return read(path, recording)
 
@@ -192,7 +192,7 @@ def _read_folder(path: Path, recording: Recording | None) -> Trajectories:
     if counts == {_KITTI}:
         return joined(path, [read_kitti(file, recording) for file in files], recording)
     found = "files of boxes alone" if (path / "trackers").is_dir() else "a folder without them"
-    raise InputError(path, _KINDS, found)
+    raise InputError(path, expected=_KINDS, found=found)
 
 
 def _read_tum(where: Path, files: Sequence[Path], recording: Recording | None) -> Trajectories:
@@ -226,8 +226,8 @@ def _read_text(path: Path, recording: Recording | None) -> Trajectories:
         return joined(path, [read_kitti(path, recording)], recording)
     raise InputError(
         path,
-        "8 numbers per line (TUM), 12 (KITTI), or 10 with commas (MOT)",
-        repr(line[:80]) if line else "no line with numbers",
+        expected="8 numbers per line (TUM), 12 (KITTI), or 10 with commas (MOT)",
+        found=repr(line[:80]) if line else "no line with numbers",
     )
 
 
@@ -279,7 +279,7 @@ def export_tracks(
         OutputError: the output exists and `force` is not set, or it cannot be written; an older one is unchanged.
     """
     if to not in FORMATS:
-        raise SettingsError("to", f"one of {', '.join(FORMATS)}", to)
+        raise SettingsError("to", expected=f"one of {', '.join(FORMATS)}", found=to)
     form, out = FORMATS[to], Path(out)
     kept = np.flatnonzero(trajectories.seen.any(axis=0))
     _check_name(out, to, len(kept), footage)
@@ -290,7 +290,7 @@ def export_tracks(
         lost = _lost_quantities(trajectories, form)
     if not form.needs_all:
         if not len(kept):
-            raise InputError("tracks", "a drone that is seen in some frame", "none")
+            raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
         trajectories = trajectories.of_drones(kept.tolist())
         if footage is not None and footage.size_m is not None:
             footage = replace(footage, size_m=footage.size_m[kept])
@@ -344,7 +344,7 @@ def _check_name(out: Path, to: str, num_seen: int, footage: Footage | None) -> N
             expected = f"a folder, because a {to.upper()} file holds one drone and the tracks have {num_seen}"
             fits = False
     if not fits:
-        raise SettingsError("--out", expected, out.name, remedy=remedy)
+        raise SettingsError("--out", expected=expected, found=out.name, remedy=remedy)
 
 
 def _check_replaceable(out: Path, to: str, force: bool) -> None:
@@ -358,7 +358,7 @@ def _check_replaceable(out: Path, to: str, force: bool) -> None:
     if foreign:
         raise OutputError(
             out,
-            f"a folder that contains only what the format {to} writes",
-            sorted(foreign)[0],
+            expected=f"a folder that contains only what the format {to} writes",
+            found=sorted(foreign)[0],
             remedy="name another folder",
         )

@@ -49,9 +49,9 @@ def read_json_tracks(path: Path) -> Trajectories:
     content = read_json(path, "JSON with tracks")
     if content.get("format") != NAME:
         remedy = "the record of a run has no positions: name its .csv or .parquet"
-        raise InputError(path, f'tracks, with "format": "{NAME}"', "other JSON", remedy=remedy)
+        raise InputError(path, expected=f'tracks, with "format": "{NAME}"', found="other JSON", remedy=remedy)
     if content.get("version") != VERSION:
-        raise InputError(path, f"version {VERSION}", f"{content.get('version')}")
+        raise InputError(path, expected=f"version {VERSION}", found=f"{content.get('version')}")
     try:
         frame = np.array(content["frame"], np.int64)
         drones = content["drones"]
@@ -65,10 +65,12 @@ def read_json_tracks(path: Path) -> Trajectories:
             **values,
         )
     except PsotrackError as error:
-        raise InputError(path, "consistent tracks", f"{error}") from error
+        raise InputError(path, expected="consistent tracks", found=f"{error}") from error
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         found = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise InputError(path, "frame, time_s and drones with a value per frame", found) from error
+        raise InputError(
+            path, expected="frame, time_s and drones with a value per frame", found=found
+        ) from error
 
 
 def _unit(name: str) -> str:

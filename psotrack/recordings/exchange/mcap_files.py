@@ -201,7 +201,11 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     """
     writer_class = _library("mcap_ros2.writer").Writer
     if (trajectories.time_s < 0).any():
-        raise InputError("tracks", "times from 0 s on, for stamps of ROS", f"{trajectories.time_s.min():g} s")
+        raise InputError(
+            "tracks",
+            expected="times from 0 s on, for stamps of ROS",
+            found=f"{trajectories.time_s.min():g} s",
+        )
     names = _ros_names(trajectories.drones, "drone")
     frames = {} if footage is None else camera_frames(footage.recording, trajectories)
     camera_names = _ros_names(list(frames), "cam")
@@ -252,7 +256,7 @@ def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
     if path.is_dir():
         files = sorted(path.glob("*.mcap"))
         if len(files) != 1:
-            raise InputError(path, "a bag with one MCAP file", f"{len(files)} MCAP files")
+            raise InputError(path, expected="a bag with one MCAP file", found=f"{len(files)} MCAP files")
         path = files[0]
     make_reader = _library("mcap.reader").make_reader
     decoder = _library("mcap_ros2.decoder").DecoderFactory()
@@ -274,13 +278,15 @@ def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
             for _, channel, _, message in reader.iter_decoded_messages(topics=topics) if topics else ():
                 rows.setdefault(channel.topic, []).append(_row(message))
     except OSError as error:
-        raise InputError(path, "a file to read", (error.strerror or f"{error}").lower()) from error
+        raise InputError(
+            path, expected="a file to read", found=(error.strerror or f"{error}").lower()
+        ) from error
     except Exception as error:  # The library raises whatever a damaged byte leads to.
         found = f"a damaged or shortened file ({type(error).__name__}: {error})".partition("\n")[0]
-        raise InputError(path, "an MCAP file", found, remedy="copy it again") from error
+        raise InputError(path, expected="an MCAP file", found=found, remedy="copy it again") from error
     if not rows:
         found = ", ".join(sorted(kinds)) or "no topic"
-        raise InputError(path, "a topic with poses or odometry of ROS 2", found)
+        raise InputError(path, expected="a topic with poses or odometry of ROS 2", found=found)
     paths = [
         _path(f"{path}, topic {topic}", names.get(topic) or _drone_of(topic, rows), each)
         for topic, each in rows.items()
@@ -318,9 +324,9 @@ def _path(where: str, name: str, rows: list[_Row]) -> Trajectories:
     time_s, position_m, orientation, covariance = (np.array(column) for column in zip(*rows, strict=True))
     again = first_repeat(time_s)
     if again is not None:
-        raise InputError(where, "one pose per time", f"two at {time_s[again]:g} s")
+        raise InputError(where, expected="one pose per time", found=f"two at {time_s[again]:g} s")
     if (far := np.abs(orientation) > LARGEST).any():
-        raise InputError(where, MODERATE, f"{orientation[far][0]:g} in an orientation")
+        raise InputError(where, expected=MODERATE, found=f"{orientation[far][0]:g} in an orientation")
     length = np.linalg.norm(orientation, axis=1)
     variance_rad2 = covariance[:, [21, 28, 35]]
     unknown = (variance_rad2 >= UNKNOWN_RAD2).any(axis=1) | (length == 0)
@@ -352,7 +358,9 @@ def _check_different(names: Sequence[str]) -> None:
     """Raise `InputError` for a drone and another drone, a camera or the world with one name."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        raise InputError("names", "drones and cameras that differ as names of ROS", f"{twice[0]} twice")
+        raise InputError(
+            "names", expected="drones and cameras that differ as names of ROS", found=f"{twice[0]} twice"
+        )
 
 
 def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advance) -> Iterator[_Message]:
@@ -414,4 +422,4 @@ def _library(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         expected, remedy = "the packages mcap and mcap-ros2-support", install_command("ros")
-        raise SettingsError("mcap", expected, f"{error}".lower(), remedy=remedy) from error
+        raise SettingsError("mcap", expected=expected, found=f"{error}".lower(), remedy=remedy) from error

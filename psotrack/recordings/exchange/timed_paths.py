@@ -61,7 +61,7 @@ def interval_s(trajectories: Trajectories) -> float:
     else:
         interval = float(time_s[0] / frame[0]) if len(frame) and frame[0] else 1.0
     if not interval > 0:
-        raise InputError("tracks", "times that increase from frame to frame", "equal times")
+        raise InputError("tracks", expected="times that increase from frame to frame", found="equal times")
     return interval
 
 
@@ -82,7 +82,7 @@ def joined(where: object, paths: Sequence[Trajectories], recording: Recording | 
         InputError: no time is within the recording, or there are no rows.
     """
     if not any(path.num_frames for path in paths):
-        raise InputError(where, "at least one pose", "none")
+        raise InputError(where, expected="at least one pose", found="none")
     all_s = np.unique(np.concatenate([path.time_s for path in paths]))
     timeline = None if recording is None else recording.timeline()
     if timeline is not None:
@@ -143,8 +143,8 @@ def _check_clock(where: object, paths: Sequence[Trajectories], timeline: Timelin
     if unit or time_s[-1] < begin_s - 1 or time_s[0] > end_s + 1:
         raise InputError(
             where,
-            f"times on the recording's clock, {begin_s:g} to {end_s:g} s",
-            f"{time_s[0]:.6g} to {time_s[-1]:.6g}{f', which look like {unit}' if unit else ' s'}",
+            expected=f"times on the recording's clock, {begin_s:g} to {end_s:g} s",
+            found=f"{time_s[0]:.6g} to {time_s[-1]:.6g}{f', which look like {unit}' if unit else ' s'}",
             remedy="write seconds" if unit else "subtract the time at which the recording begins",
         )
 
@@ -181,5 +181,5 @@ def _interpolated(
     parts = [resample(path, frame, instant_s, gap_s=_GAP * _usual_interval_s(path.time_s)) for path in paths]
     if not any(np.isfinite(part.position_m).any() for part in parts):
         expected = "two samples of a drone with an instant of the recording between them"
-        raise InputError(where, expected, "none")
+        raise InputError(where, expected=expected, found="none")
     return merged(parts, [frame] * len(parts), lambda number: instant_s[number])

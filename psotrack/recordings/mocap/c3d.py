@@ -63,7 +63,9 @@ class Markers:
     def __post_init__(self) -> None:
         if self.position_m.shape[1:] != (len(self.labels), 3):
             raise SettingsError(
-                "markers", f"positions of shape (frames, {len(self.labels)}, 3)", f"{self.position_m.shape}"
+                "markers",
+                expected=f"positions of shape (frames, {len(self.labels)}, 3)",
+                found=f"{self.position_m.shape}",
             )
 
 
@@ -86,7 +88,7 @@ def read_c3d(path: Path | str) -> Markers:
     try:
         processor, header, parameters = read_layout(content)
     except ValueError as error:
-        raise InputError(path, "a C3D file", str(error)) from error
+        raise InputError(path, expected="a C3D file", found=str(error)) from error
     data = _find_points(path, content, processor, header, parameters)
     position, seen = data.read(content)
     position_m = np.where(seen[..., None], position * _metres_per_unit(path, parameters), np.nan)
@@ -95,7 +97,7 @@ def read_c3d(path: Path | str) -> Markers:
     if len(far):
         frame, marker = far[0].tolist()
         found = f"{np.abs(position_m[frame, marker]).max():.3g} m for marker {marker + 1} in frame {frame}"
-        raise InputError(path, f"positions of at most {_FARTHEST_M:g} m", found)
+        raise InputError(path, expected=f"positions of at most {_FARTHEST_M:g} m", found=found)
     rate_hz = parameters.number("POINT:RATE") or header.rate_hz
     check_rate(path, rate_hz)
     first = _long_number(parameters, "TRIAL:ACTUAL_START_FIELD") or header.first_frame
@@ -120,7 +122,9 @@ def write_c3d(path: Path | str, markers: Markers) -> None:
     """
     num_frames, num_markers, _ = markers.position_m.shape
     if num_frames > _MAX_FRAMES:
-        raise SettingsError("markers", f"at most {_MAX_FRAMES} frames in a C3D file", f"{num_frames}")
+        raise SettingsError(
+            "markers", expected=f"at most {_MAX_FRAMES} frames in a C3D file", found=f"{num_frames}"
+        )
     content = ezc3d.c3d()
     parameters = content["parameters"]["POINT"]
     parameters["UNITS"]["value"] = ["mm"]
@@ -135,7 +139,7 @@ def write_c3d(path: Path | str, markers: Markers) -> None:
         content.write(str(temporary))
         # ezc3d reports no error when the disk is full.
         if not _is_complete(temporary, markers):
-            raise OutputError(path, "a path that can be written", "an incomplete file")
+            raise OutputError(path, expected="a path that can be written", found="an incomplete file")
 
 
 def _is_complete(path: Path, markers: Markers) -> bool:
@@ -201,16 +205,18 @@ def _find_points(
     """The layout of the points, by what the parameters say, what the header says, and what the file holds."""
     used = parameters.count("POINT:USED")
     if parameters.values and not any(name.startswith("POINT:") for name in parameters.values):
-        raise InputError(path, "a C3D file with parameters of its points, POINT:LABELS and the like", "none")
+        raise InputError(
+            path, expected="a C3D file with parameters of its points, POINT:LABELS and the like", found="none"
+        )
     if not (header.num_points if used is None else used):
         num_analog = header.num_analog
         found = f"none, only {num_analog} analogue samples per frame" if num_analog else "none"
-        raise InputError(path, "markers over time", found)
+        raise InputError(path, expected="markers over time", found=found)
     scale = _scale(path, header, parameters)
     block = header.data_block or parameters.count("POINT:DATA_START") or 0
     start = (block - 1) * BLOCK_BYTES
     if start < BLOCK_BYTES:
-        raise InputError(path, "a C3D file", "none that says where its frames begin")
+        raise InputError(path, expected="a C3D file", found="none that says where its frames begin")
     layouts = [
         _Points(processor, scale, start, num_points, num_analog)
         for num_points in dict.fromkeys(each for each in (used, header.num_points) if each)
@@ -227,14 +233,14 @@ def _scale(path: Path, header: Header, parameters: Parameters) -> float:
     stated = parameters.number("POINT:SCALE")
     scale = stated or header.scale
     if not np.isfinite(scale) or scale == 0:
-        raise InputError(path, "a scale of the coordinates", f"{scale:g}")
+        raise InputError(path, expected="a scale of the coordinates", found=f"{scale:g}")
     if header.scale and (
         (scale < 0) != (header.scale < 0) or (scale > 0 and not np.isclose(scale, header.scale, rtol=1e-4))
     ):
         raise InputError(
             path,
-            "one scale of the coordinates",
-            f"{header.scale:g} in its header and {scale:g} in POINT:SCALE",
+            expected="one scale of the coordinates",
+            found=f"{header.scale:g} in its header and {scale:g} in POINT:SCALE",
         )
     return scale
 
@@ -276,7 +282,9 @@ def _count_frames(path: Path, header: Header, stated: int | None, available: int
         InputError: no whole frame is there.
     """
     if not available:
-        raise InputError(path, "markers over time", "no whole frame", remedy="is the file cut short?")
+        raise InputError(
+            path, expected="markers over time", found="no whole frame", remedy="is the file cut short?"
+        )
     if stated is None:
         # The last block is filled up, with room for frames that are none.
         filled = available * frame_bytes - header.num_frames * frame_bytes < BLOCK_BYTES
@@ -304,7 +312,7 @@ def _metres_per_unit(path: Path, parameters: Parameters) -> float:
         meant = {_WORDS[word] for word in _WORDS if word.startswith(unit) or word == f"{unit}s"}
         unit = meant.pop() if len(meant) == 1 else unit
     if unit not in _METRES_PER_UNIT:
-        raise InputError(path, f"a unit of {', '.join(_METRES_PER_UNIT)}", repr(written))
+        raise InputError(path, expected=f"a unit of {', '.join(_METRES_PER_UNIT)}", found=repr(written))
     return _METRES_PER_UNIT[unit]
 
 

@@ -84,8 +84,8 @@ def drone_markers(
             found = f"unidentified markers only ({_shown(markers, range(len(markers.labels)))})"
         raise NoDronesError(
             where,
-            f"drones, rigid bodies of {_FEWEST} to {_MOST} markers",
-            found,
+            expected=f"drones, rigid bodies of {_FEWEST} to {_MOST} markers",
+            found=found,
             remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies], or leave "
             "the file out",
         )
@@ -117,7 +117,7 @@ def _named_markers(markers: Markers, where: Path | str, name: str, labels: Seque
             expected, found = f"labels of {', '.join(known.values())}", repr(label)
             if fitting:
                 expected, found = f"one marker called {label!r}", f"{len(fitting)}"
-            raise SettingsError(f"body {name}, {where}", expected, found)
+            raise SettingsError(f"body {name}, {where}", expected=expected, found=found)
         columns += [index for index in fitting if index not in columns]
     fault = _fault(markers, columns)
     if fault:
@@ -195,7 +195,7 @@ def marker_bodies(
     poses = [_body_poses(markers, name, columns, where) for name, columns in bodies.items()]
     position_m, orientation_wxyz, bridged = (np.stack(each, axis=1) for each in zip(*poses, strict=True))
     if np.isnan(position_m).all():
-        raise InputError(where, "three markers of a drone in some frame", "none")
+        raise InputError(where, expected="three markers of a drone in some frame", found="none")
     turned = not np.isnan(orientation_wxyz).all()
     status = np.where(bridged, Status.COASTING, Status.TRACKED)
     return Trajectories(

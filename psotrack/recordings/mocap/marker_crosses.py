@@ -122,8 +122,8 @@ def _shape_from_distances(
         first, second = np.argwhere(~together)[0] + 1
         raise InputError(
             f"cross {name}",
-            "every two markers seen together in some frame",
-            f"{first} and {second} never" if first != second else f"marker {first} never seen",
+            expected="every two markers seen together in some frame",
+            found=f"{first} and {second} never" if first != second else f"marker {first} never seen",
         )
     squares = np.nanmedian(distances_m, axis=0) ** 2
     centring = np.eye(len(squares)) - 1 / len(squares)
