@@ -1,4 +1,4 @@
-from .camera_recording import ARRAY_FILE, MADE_OF, CameraRecording, StoredSilhouettes, probe_silhouettes
+from .camera_recording import CameraRecording
 from .detections import Detections, read_detections, write_detections
 from .image_files import (
     IMAGE_SUFFIXES,
@@ -27,6 +27,7 @@ from .recording_file import (
     recording_file_text,
     write_recording_file,
 )
+from .stored_silhouettes import ARRAY_FILE, MADE_OF, StoredSilhouettes, probe_silhouettes
 from .timing import (
     MOST_INSTANTS,
     REACH,

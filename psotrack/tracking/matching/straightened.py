@@ -76,6 +76,7 @@ def _ends(camera: Camera) -> tuple[Float[np.ndarray, "angles"], Float[np.ndarray
     pixels = camera.K[:2, 2] + bent[..., None] * across * np.diagonal(camera.K)[:2]
     ray = np.linalg.norm(undistort(camera, pixels), axis=-1)
     with np.errstate(invalid="ignore"):
+        # Of an orthographic lens, ray = bent / sqrt(1 - bent^2), whose slope is (1 + ray^2) ray / bent.
         slope, share = np.diff(ray, axis=0) / np.diff(bent, axis=0), ray / bent
         is_lens = slope <= (1 + ray[1:] ** 2) * share[1:]
     last = np.minimum(np.cumprod(is_lens, axis=0).sum(axis=0), len(is_lens) - 1), np.arange(len(_ANGLES))
