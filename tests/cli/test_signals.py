@@ -73,7 +73,6 @@ import signal, sys
 import psotrack.__main__
 
 class Last:
-    # At the end of Python all modules are empty.
     def __del__(self, send=signal.raise_signal, number=signal.SIGTERM):
         send(number)
 

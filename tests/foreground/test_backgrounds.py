@@ -346,7 +346,6 @@ _noise = np.random.default_rng(8)
 #: Frames -> what the camera shows instead of each: the brightness as a factor, or another picture.
 LOST_LIGHT = {
     "begins dark": {i: (i + 1) / 15 for i in range(15)},
-    "begins slowly": {i: (i + 1) / 40 for i in range(40)},
     "begins at 30 %": dict.fromkeys(range(25), 0.3),
     "three black at first": dict.fromkeys(range(3), BLACK),
     "nine black at first": dict.fromkeys(range(9), BLACK),
@@ -354,7 +353,6 @@ LOST_LIGHT = {
     "nine grey at first": dict.fromkeys(range(9), np.uint8([128, 128, 128])),
     "black for long": dict.fromkeys(range(30, 70), BLACK),
     "five black": dict.fromkeys(BURST, BLACK),
-    "one black": {60: BLACK},
     "bursts": dict.fromkeys([*range(20, 25), *BURST], BLACK),
     "blue": dict.fromkeys(BURST, BLUE),
     "white": dict.fromkeys(BURST, np.uint8([255, 255, 255])),
