@@ -293,10 +293,13 @@ def warn_of_blind_cameras(run: Run, tracks: Tracks, shown: Bool[np.ndarray, "fra
         if blind.sum() > max(_BLIND_SHARE * of_camera.sum(), run.recording.fps):
             logger.warning(
                 "camera %s shows no drone in %d of the %d instants at which the tracks have one in its view; "
-                "look at what it sees: `psotrack detect --silhouettes`",
+                "look at %s",
                 name,
                 blind.sum(),
                 of_camera.sum(),
+                "its detections"
+                if run.silhouettes is None
+                else "what it sees: `psotrack detect --silhouettes`",
             )
 
 

@@ -77,7 +77,6 @@ class Last:
         send(number)
 
 sys.modules["last"] = Last()
-sys.argv = ["psotrack", "--version"]
 psotrack.__main__.main()
 """
 #: A command whose worker processes say something when they end.
@@ -113,6 +112,7 @@ def press(phase, info):
         signal.raise_signal(signal.SIGINT)
 
 gc.callbacks.append(press)
+gc.set_threshold(50)
 from psotrack.__main__ import main
 main()
 """
@@ -205,7 +205,7 @@ def test_an_error_of_a_library_that_is_interrupted_is_no_traceback(start_python,
 
 def test_a_signal_after_the_end_changes_nothing(start_python):
     """Found: a command whose results were whole ended with code -15 and without a line."""
-    process = start_python("-c", AT_THE_END)
+    process = start_python("-c", AT_THE_END, "--version")
     out, err = process.communicate(timeout=FOREVER_S)
     assert (process.returncode, err) == (0, "")
     assert "version" in out

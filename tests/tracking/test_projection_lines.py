@@ -535,18 +535,30 @@ def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
     np.testing.assert_allclose(found.position_m, place_m, atol=0.1)
 
 
-def test_a_recording_of_detections_is_tracked_within_the_volume_that_is_found(tmp_path, caplog):
-    rig, truth_m = ground_rig(3), flights(30, (9.0,))
-    sightings = see_all(rig, truth_m)
-    write_rig(tmp_path / "rig.toml", rig)
+def write_recording(folder, rig, sightings):
+    write_rig(folder / "rig.toml", rig)
     lines = ["version = 1", 'calibration = "rig.toml"']
     for camera, name in enumerate(rig.names):
         frame, box = np.nonzero(np.isfinite(sightings.noise_px[:, camera]))
         centre = sightings.centre_px[frame, camera, box] + 0.5
         boxes = np.concatenate([centre - 6, centre + 6], axis=1)
-        write_detections(tmp_path / f"{name}.csv", Detections(frame, boxes, np.ones(len(frame))))
+        write_detections(folder / f"{name}.csv", Detections(frame, boxes, np.ones(len(frame))))
         lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', "size = [1920, 1080]", f"fps = {FPS}"]
-    (tmp_path / "recording.toml").write_text("\n".join(lines) + "\n")
+    (folder / "recording.toml").write_text("\n".join(lines) + "\n")
+
+
+def test_a_camera_that_shows_no_drone_where_the_tracks_have_one_is_named(tmp_path, caplog):
+    sightings = see_all(ground_rig(4), flights(60, (9.0,)))
+    sightings.noise_px[20:-1, 3] = np.nan
+    write_recording(tmp_path, ground_rig(4), sightings)
+    settings = TrackSettings(method="projection-lines")
+    track_recording(open_recording(tmp_path), settings, cache=tmp_path / "cache")
+    assert "camera 3 shows no drone in 39 of the 60 instants" in caplog.text
+
+
+def test_a_recording_of_detections_is_tracked_within_the_volume_that_is_found(tmp_path, caplog):
+    rig, truth_m = ground_rig(3), flights(30, (9.0,))
+    write_recording(tmp_path, rig, see_all(rig, truth_m))
     settings = TrackSettings(method="projection-lines")
     tracked = track_recording(open_recording(tmp_path), settings, cache=tmp_path / "cache")
     assert tracked.trajectories.num_drones == 1

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Real, UInt8
 
 #: Parts along the longer side of the image. A part must be larger than a drone, so that its median shows the light.
 _PARTS = 10
@@ -93,7 +93,7 @@ class Comparison(NamedTuple):
     lasting_frames: float = math.inf
 
 
-def light_of(background: Float[np.ndarray, "height width 3"]) -> Light:
+def light_of(background: Real[np.ndarray, "height width 3"]) -> Light:
     """The light of a background, grey levels: (height, width, 3)."""
     height, width = background.shape[:2]
     parts = _parts(height, max(height, width)), _parts(width, max(height, width))
