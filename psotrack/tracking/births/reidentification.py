@@ -41,8 +41,8 @@ STILL_S = (1.0, 0.5)
 #: A candidate stayed at a place, or departed from it, if it is nearer to the place than this number of spans, or was so
 #: within the last `DEPARTURE_S` seconds.
 STAYED_SPANS, DEPARTURE_S = 0.6, 0.6
-#: Probability that a drone stops or turns at once while it is out of sight, so that it is anywhere within reach.
-TURNED_PROBABILITY = 0.1
+#: Probability that a drone stops or turns at once while it is out of sight, with any velocity then.
+TURNED_PROBABILITY = 0.4
 #: Odds of a new drone against a lost drone where no new ones come, and of no drone if the candidate does not move. A
 #: candidate that is not sure waits for the frames that make it so, unless a lost drone is clearly more probable.
 NEW_ODDS, UNSURE_ODDS, NO_DRONE_ODDS = 0.1, 3.0, 10.0
@@ -299,11 +299,12 @@ def _log_likelihood(
         return _UNREACHABLE - distance
     before = np.stack([place, velocity])
     after = np.stack([candidate.position_m, candidate.velocity_m_s])
-    log_turned = np.log(TURNED_PROBABILITY / (4 / 3 * np.pi * reach_m**3))
-    log_turned += _log_velocity(candidate.velocity_m_s, limits)
+    own, any_drone = _speeds2(velocity, limits)
+    log_turned = log_transition(before, after, gap_s, any_drone, limits.bounds_m, parts=1)
+    log_turned += np.log(TURNED_PROBABILITY) + _log_velocity(candidate.velocity_m_s, limits)
     log_flown = max(
         log_turned,
-        *(log_transition(before, after, gap_s, each, limits.bounds_m) for each in _speeds2(velocity, limits)),
+        *(log_transition(before, after, gap_s, each, limits.bounds_m) for each in (own, any_drone)),
     )
     num_flying = sum(
         not doubtful and not _stands(lost, each, limits) for each, doubtful in enumerate(lost.doubtful)
@@ -383,7 +384,13 @@ Motion = Float[np.ndarray, "2 3"]
 
 
 def log_transition(
-    before: Motion, after: Motion, gap_s: float, variance: float, bounds_m: Float[np.ndarray, "2 3"]
+    before: Motion,
+    after: Motion,
+    gap_s: float,
+    variance: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+    *,
+    parts: int = 2,
 ) -> float:
     """Log density of a measured state after a gap, over position and velocity: an Ornstein-Uhlenbeck process.
 
@@ -396,6 +403,7 @@ def log_transition(
         gap_s: time between them, at least 0.
         variance: stationary variance of the velocity along each axis, m2/s2.
         bounds_m: (2, 3), corners of the room.
+        parts: 1 for the density over the position alone.
     """
     time = VELOCITY_TIME_S
     decay = np.exp(-gap_s / time)
@@ -407,8 +415,8 @@ def log_transition(
         ]
     )
     measured = np.diag([POSITION_STD_M**2, VELOCITY_STD_M_S**2])
-    covariance = transition @ measured @ transition.T + process + measured
-    error = _reflect(after, bounds_m) - (transition @ before)[:, None]
+    covariance = (transition @ measured @ transition.T + process + measured)[:parts, :parts]
+    error = (_reflect(after, bounds_m) - (transition @ before)[:, None])[:parts]
     distance2 = np.einsum("iwa,ij,jwa->wa", error, np.linalg.inv(covariance), error)
     per_axis = logsumexp(-distance2 / 2, axis=0)
     return float(per_axis.sum() - 3 * np.log(np.linalg.det(2 * np.pi * covariance)) / 2)
