@@ -328,7 +328,7 @@ def test_order_and_world_frame_do_not_matter(seed):
 def test_a_lens_that_folds_within_the_image_is_continued():
     """A published lens has no ray for pixels near the border; the camera shows a drone there."""
     K, pose = np.array([[1570.0, 0, 960], [0, 1570, 540], [0, 0, 1]]), {"R": np.eye(3), "t_m": np.zeros(3)}
-    lenses = (np.array(dist) for dist in ((0.013, 0.96, 0, 0, -4.15), (-0.1, 0.01, 0, 0, 0)))
+    lenses = ((0.013, 0.96, 0.0, 0.0, -4.15), (-0.1, 0.01, 0.0, 0.0, 0.0))
     cameras = [make_camera(**pose, K=K, dist=dist, image_size_wh=(1920, 1080)) for dist in lenses]
     pixels = np.array([[[[500.0, 400.0], [60.0, 250.0]]] * 2])
     sightings = Sightings(pixels, np.full(pixels.shape, 10.0), np.full(pixels.shape[:-1], 2.0))

@@ -178,7 +178,8 @@ def _change(
     """How far apart two shifts are, pixels, and the squared distance by what the equations tell of it."""
     (first_px, first), (second_px, second) = (_solved(each) for each in (before, after))
     change_px = second_px - first_px
-    return change_px, np.vecdot(change_px, np.linalg.solve(first + second, change_px[..., None])[..., 0])
+    clear = np.vecdot(change_px, np.linalg.solve(first + second, change_px[..., None])[..., 0])
+    return change_px, np.asarray(clear)
 
 
 def _solved(
