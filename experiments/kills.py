@@ -27,7 +27,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-#: Time to the end that is counted as a failure, seconds. The machine may be busy.
+#: Time to the end that is counted as a failure, seconds; longer on a machine with more work than processors.
 LONGEST_S = 2.0
 #: Exit codes of signals that a command answers, and the first word of its line.
 CODES = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
@@ -223,7 +223,7 @@ def kill(
             right |= process.returncode == code and line.startswith(f"psotrack: {word}; ")
             if not right or line.count("\n") > 1:
                 faults.append(f"code {process.returncode}: {line[-200:]!r}")
-        if took_s > LONGEST_S:
+        if took_s > LONGEST_S * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1)):
             faults.append(f"{took_s:.1f} s to the end")
     for process in processes[len(killed) :]:
         if (other := ended(process, faults)) and process.returncode != 0:
