@@ -219,6 +219,8 @@ def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
     """Width and height that the header of an image states, before OpenCV asks for the memory that they take."""
     # Pillow refuses a PNG whose notes are damaged, too.
     if data.startswith(_PNG) and len(data) >= _PNG_HEAD:
+        if not _has_its_parts(data):
+            raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
         return struct.unpack_from(">II", data, _PNG_HEAD - 8)
     try:
         with warnings.catch_warnings():
@@ -233,6 +235,15 @@ def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
     except Exception as error:
         found = f"a file that is no PNG, {', '.join(_FORMATS)}, or a damaged one"
         raise InputError(where, expected="an image", found=found) from error
+
+
+def _has_its_parts(png: bytes) -> bool:
+    """Whether all parts of a PNG lie within the file: OpenCV takes the memory that a part states as its length."""
+    begin = len(_PNG)
+    while begin < len(png) and png[begin + 4 : begin + 8] != b"IEND":
+        # Length, name and checksum of a part take twelve bytes.
+        begin += 12 + int.from_bytes(png[begin : begin + 4], "big")
+    return begin < len(png)
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:

@@ -67,4 +67,4 @@ def test_notebook_runs_at_tiny_size(script, folder, monkeypatch):
     # No limit for a cell, which may wait for the compiler.
     place = {"metadata": {"path": folder}}
     NotebookClient(committed_notebook(script), timeout=None, resources=place).execute()
-    assert (folder / "data" / "tiny").exists() or script.stem == "table_5"
+    assert list((folder / "data").glob("tiny*")) or script.stem == "table_5"

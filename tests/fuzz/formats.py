@@ -90,9 +90,9 @@ def _calibration(path: str, words: str = "") -> Format:
 
 
 _CALIBRATIONS = {
-    "rig.toml": _calibration("rig.toml/rig.toml"),
+    "rig.toml": _calibration("rig.toml/rig.toml", "--size 320,240"),
     "opencv-yaml": _calibration("opencv-yaml/rig.yml", "--size 320,240"),
-    "caliscope": _calibration("caliscope/camera_array.toml"),
+    "caliscope": _calibration("caliscope/camera_array.toml", "--size 320,240"),
     "anipose": _calibration("anipose/calibration.toml", "--size 320,240"),
     "dpjait-cameras": _calibration("dpjait-cameras/cameras.csv"),
     "opencv-json": _calibration("opencv-json/rig.json", "--units m"),
