@@ -266,6 +266,7 @@ def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResu
 
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found
+        warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
         result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, shares)
         return _with_camera_errors(run, result, places, silhouettes.exposures)
 
@@ -289,6 +290,9 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
             report=report,
         )
     seconds["track"] += run.read_s
+    # Where there are silhouettes, they tell what the cameras see.
+    if run.silhouettes is None:
+        warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
     return _with_camera_errors(run, result, places)
 
@@ -301,9 +305,6 @@ def _with_camera_errors(
     if not tracks.num_drones:
         return result
     began = time.perf_counter()
-    # Where both methods run, the silhouettes tell what the cameras see.
-    if exposures is not None or run.silhouettes is None:
-        warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
     found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
     position_m, velocity_m_s = (
         np.where(found, np.asarray(value, np.float64), np.nan)

@@ -33,9 +33,9 @@ _STEEP = 0.5
 #: noise and codecs add. In shares of the mean difference, drawn and real drones have 0.5 to 3 down to 3 px; drifting
 #: clouds 0.06 to 0.5.
 _SHARP, _NOISE_GRADIENT = 0.4, 2.0
-#: The share for a fast object, such as a ball of 10 px that is blurred over 30: the frame before showed less than this
-#: share of its difference at the same place, and so many of its pixels are strong. Of speckle in a codec's key frames,
-#: which comes suddenly too, fewer are.
+#: The share for a fast object, such as a ball of 10 px that is blurred over 30. An object is fast if the frame before
+#: showed less than the second share of its difference at the same place, and more than the third share of its pixels
+#: are strong. Speckle in a codec's key frames comes suddenly too, but fewer of its pixels are strong.
 _SHARP_FAST, _SEEN_BEFORE, _FAST_STRONG = 0.25, 0.5, 0.6
 #: Larger differences do not need sharper contours, grey levels.
 _SHARP_DIFFERENCE = 40.0

@@ -116,10 +116,8 @@ def _steps(
         best = int(np.where(dense, clear, 0.0).argmax())
         at = first[best]
         shortest = total[at] - total[at - _WINDOWS[0] // 2], total[at + _WINDOWS[0] // 2] - total[at]
-        length2, sudden = (
-            float(change_px[best] @ change_px[best]),
-            float(_change(*shortest)[0] @ change_px[best]),
-        )
+        length2 = float(change_px[best] @ change_px[best])
+        sudden = float(_change(*shortest)[0] @ change_px[best])
         part = _part_that_stays(change_px[best], equations, sets, int(at))
         begin, end = max(at - 2 * window, 0), min(at + 2 * window, len(frames))
         longer = float(_change(total[at] - total[begin], total[end] - total[at])[0] @ change_px[best])

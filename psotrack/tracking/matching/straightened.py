@@ -61,24 +61,31 @@ def _straight(
     """Pixels without distortion, and by how much small lengths grow there."""
     focal_px, middle_px = np.diagonal(camera.K)[:2], camera.K[:2, 2]
     off = (pixels - middle_px) / focal_px
-    bent, angle = np.maximum(np.linalg.norm(off, axis=-1), 1e-9), np.arctan2(off[:, 1], off[:, 0])
-    edge, along = (np.interp(angle, _ANGLES, each, period=2 * np.pi) for each in _ends(camera))
-    share = np.minimum(edge / bent, 1.0)
-    rays = undistort(camera, middle_px + share[:, None] * off * focal_px)
-    longer = 1 + along * (1 - share) * bent / np.maximum(np.linalg.norm(rays, axis=-1), 1e-9)
-    return rays * longer[:, None] * focal_px + middle_px, undistortion_stretch(camera, rays)
+    bent = np.maximum(np.linalg.norm(off, axis=-1), 1e-9)
+    angle = np.arctan2(off[:, 1], off[:, 0])
+    end, slope = (np.interp(angle, _ANGLES, each, period=2 * np.pi) for each in _ends(camera))
+    within = np.minimum(bent, end)
+    rays = undistort(camera, middle_px + (within / bent)[:, None] * off * focal_px)
+    length = np.maximum(np.linalg.norm(rays, axis=-1), 1e-9)
+    straight = rays * (1 + slope * (bent - within) / length)[:, None]
+    return straight * focal_px + middle_px, undistortion_stretch(camera, rays)
 
 
 def _ends(camera: Camera) -> tuple[Float[np.ndarray, "angles"], Float[np.ndarray, "angles"]]:
-    """Distance from the axis in the image, normalised, up to which a model is a lens; rays' change by it beyond."""
+    """For each direction, the distance from the axis up to which a model is a lens, and the slope of rays beyond.
+
+    Distances are normalised, in the image with distortion; the slope is the change of the distance without distortion.
+    """
     bent = np.arange(1, 200)[:, None] / 100
     across = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
     pixels = camera.K[:2, 2] + bent[..., None] * across * np.diagonal(camera.K)[:2]
     ray = np.linalg.norm(undistort(camera, pixels), axis=-1)
     with np.errstate(invalid="ignore"):
         # Of an orthographic lens, ray = bent / sqrt(1 - bent^2), whose slope is (1 + ray^2) ray / bent.
-        slope, share = np.diff(ray, axis=0) / np.diff(bent, axis=0), ray / bent
-        is_lens = slope <= (1 + ray[1:] ** 2) * share[1:]
-    last = np.minimum(np.cumprod(is_lens, axis=0).sum(axis=0), len(is_lens) - 1), np.arange(len(_ANGLES))
-    # Beyond, the truth is between the direction in which the model goes there, and no distortion.
-    return bent[last[0], 0], 2 / (1 / slope[np.maximum(last[0] - 1, 0), last[1]] + 1 / share[last])
+        slope = np.diff(ray, axis=0) / np.diff(bent, axis=0)
+        is_lens = slope <= (1 + ray[1:] ** 2) * (ray / bent)[1:]
+    last = np.minimum(np.cumprod(is_lens, axis=0).sum(axis=0), len(is_lens) - 1)
+    direction = np.arange(len(_ANGLES))
+    # Beyond, the truth is between the slope that the model has there, and that of no distortion.
+    of_model, of_none = slope[np.maximum(last - 1, 0), direction], ray[last, direction] / bent[last, 0]
+    return bent[last, 0], 2 / (1 / of_model + 1 / of_none)
