@@ -38,8 +38,9 @@ logger = logging.getLogger(__name__)
 #: Where detections of different cameras meet in a smaller share of the frames, something is wrong with the cameras:
 #: rays of false detections meet by chance.
 _FEW_MET = 0.2
-#: A camera that shows nothing in a larger share of the instants at which it should, and for a second, is named.
-_BLIND_SHARE = 0.5
+#: A camera is named that shows nothing in a larger share of the instants at which it should, from some instant on, for
+#: a second and a larger share of all these instants.
+_BLIND_SHARE, _LEAST_BLIND = 0.5, 0.2
 #: Number of frames in which explained detections are counted.
 _COUNTED_FRAMES = 100
 #: Tracks and a camera's detections do not belong together where less than this share of both has a partner: false
@@ -275,7 +276,7 @@ def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:
 
 
 def warn_of_blind_cameras(run: Run, tracks: Tracks, shown: Bool[np.ndarray, "frames drones cameras"]) -> None:
-    """Name the cameras that show no drone in most of the instants at which they should, by the tracks.
+    """Name the cameras that show no drone in most instants at which they should, by the tracks, from some instant on.
 
     Args:
         run: the run.
@@ -287,16 +288,23 @@ def warn_of_blind_cameras(run: Run, tracks: Tracks, shown: Bool[np.ndarray, "fra
     exposures = None if run.silhouettes is None else run.silhouettes.exposures
     there = run.recording.timeline().is_there if exposures is None else np.asarray(exposures.is_there)
     should = in_view.any(axis=1) & there
-    for name, of_camera, blind in zip(
-        run.recording.rig.names, should.T, (should & ~shown.any(axis=1)).T, strict=True
-    ):
-        if blind.sum() > max(_BLIND_SHARE * of_camera.sum(), run.recording.fps):
+    for name, of_camera, is_shown in zip(run.recording.rig.names, should.T, shown.any(axis=1).T, strict=True):
+        instants = np.flatnonzero(of_camera)
+        blind = ~is_shown[instants]
+        # A camera that is turned away, or goes blind, does so at some instant.
+        more_than_usual = np.cumsum((blind - _BLIND_SHARE)[::-1])[::-1]
+        first = int(more_than_usual.argmax()) if len(instants) else 0
+        lately = blind[first:]
+        if lately.sum() > max(_BLIND_SHARE * len(lately), run.recording.fps) and (
+            len(lately) > _LEAST_BLIND * len(instants)
+        ):
             logger.warning(
-                "camera %s shows no drone in %d of the %d instants at which the tracks have one in its view; "
-                "look at %s",
+                "camera %s shows no drone in %d of the last %d instants at which the tracks have one in its view, from "
+                "frame %d on; look at %s",
                 name,
-                blind.sum(),
-                of_camera.sum(),
+                lately.sum(),
+                len(lately),
+                instants[first],
                 "its detections"
                 if run.silhouettes is None
                 else "what it sees: `psotrack detect --silhouettes`",

@@ -67,9 +67,10 @@ from psotrack.tracking.births import (
     start_source,
     with_speed_of_tracks,
 )
-from psotrack.tracking.camera_errors import views_of_places, with_camera_errors
+from psotrack.tracking.camera_errors import views_of_places, with_camera_errors, with_nearest_sightings
 from psotrack.tracking.fusion import fuse_tracks
 from psotrack.tracking.lines import track_detections
+from psotrack.tracking.matching import Sightings
 from psotrack.tracking.swarm import Places, RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status, Tracks
 
@@ -294,13 +295,25 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
     if run.silhouettes is None:
         warn_of_blind_cameras(run, tracks, np.isfinite(places.middle_px).all(axis=-1))
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
-    return _with_camera_errors(run, result, places)
+    return _with_camera_errors(run, result, places, sightings=run.sightings)
 
 
 def _with_camera_errors(
-    run: Run, result: MethodResult, places: Places, exposures: Exposures | None = None
+    run: Run,
+    result: MethodResult,
+    places: Places,
+    exposures: Exposures | None = None,
+    sightings: Sightings | None = None,
 ) -> MethodResult:
-    """The result with covariances that hold for the errors that the cameras show at the drones' places."""
+    """The result with covariances that hold for the errors that the cameras show at the drones' places.
+
+    Args:
+        run: the run.
+        result: its result.
+        places: the drones' places in the images.
+        exposures: exposures of the frames that show the places; None where they were all exposed at the instant.
+        sightings: what the cameras see, where tracks follow from it.
+    """
     tracks, settings = result.tracks, run.settings
     if not tracks.num_drones:
         return result
@@ -313,7 +326,14 @@ def _with_camera_errors(
     cameras = run.recording.rig.cameras
     middle_px, weight = places.middle_px, places.weight
     views = views_of_places(cameras, middle_px, weight, position_m, velocity_m_s, exposures)
-    tracks, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, run.recording.fps)
+    all_views = None
+    if sightings is not None:
+        states = position_m, velocity_m_s
+        all_px = with_nearest_sightings(cameras, middle_px, sightings, *states)
+        all_views = views_of_places(cameras, all_px, np.ones(all_px.shape), *states)
+    tracks, errors = with_camera_errors(
+        tracks, views, settings.motion, settings.errors, run.recording.fps, all_views
+    )
     seconds = {**result.seconds, "finish": time.perf_counter() - began}
     return replace(result, tracks=tracks, errors=errors, seconds=seconds)
 

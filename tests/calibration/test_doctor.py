@@ -275,14 +275,15 @@ def test_tracks_say_which_share_of_the_detections_they_explain(tmp_path, caplog)
 
 @pytest.mark.slow
 def test_a_knocked_camera_is_left_out_of_tracks_or_widens_their_covariances(tmp_path, caplog):
-    for cameras in (5, 3):
+    # By 4 px, and so far that its sightings no longer count in the tracks.
+    for cameras, px in ((5, 4), (3, 4), (4, 20)):
         world = World(cameras=cameras, drones=1, size=0.4, frames=200)
-        seen = knocked(world.seen, "cam2", 120, (3.2, 2.4))
+        seen = knocked(world.seen, "cam2", 120, (0.8 * px, 0.6 * px))
         tracked = pt.track(
             record_detections(tmp_path / f"{cameras}", seen, world.rig), method="projection-lines"
         )
         (knock,) = tracked.record["knocks"]
-        assert (knock["camera"], knock["left_out"]) == ("cam2", cameras == 5)
+        assert (knock["camera"], knock["left_out"]) == ("cam2", cameras > 3)
         assert abs(knock["frame"] - 120) <= 2
         assert re.search(r"camera cam2: it was knocked at frame 1[12]\d", caplog.text)
         flown = tracked.trajectories

@@ -553,7 +553,7 @@ def test_a_camera_that_shows_no_drone_where_the_tracks_have_one_is_named(tmp_pat
     write_recording(tmp_path, ground_rig(4), sightings)
     settings = TrackSettings(method="projection-lines")
     track_recording(open_recording(tmp_path), settings, cache=tmp_path / "cache")
-    assert "camera 3 shows no drone in 39 of the 60 instants" in caplog.text
+    assert "camera 3 shows no drone in 39 of the last 40 instants" in caplog.text
 
 
 def test_a_recording_of_detections_is_tracked_within_the_volume_that_is_found(tmp_path, caplog):

@@ -166,7 +166,7 @@ def _find_knock(rig: Rig, seen: ExaminedFrames, data: WeightedPoints) -> Knock |
     def knock_in(data: WeightedPoints) -> Knock | None:
         slopes = linearise(Corrected(rig, np.zeros(len(rig))), data.points, data.position_m)
         residual_px, is_used = np.nan_to_num(slopes.residual_px), data.used
-        return find_knock([(FittedPlaces(residual_px, slopes.by_point, is_used), data.points.frame)])
+        return find_knock([(FittedPlaces(residual_px, slopes.by_point, is_used), is_used, data.points.frame)])
 
     knock = knock_in(data)
     if knock is None:

@@ -11,7 +11,7 @@ from .knocks import Knock, find_knock
 from .learning import Autocorrelation, CameraErrors, autocorrelation_of, learn_camera_errors
 from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
-from .views import CameraViews, views_of_places
+from .views import CameraViews, views_of_places, with_nearest_sightings
 
 __all__ = [
     "Autocorrelation",
@@ -34,4 +34,5 @@ __all__ = [
     "systematic_covariances",
     "views_of_places",
     "with_camera_errors",
+    "with_nearest_sightings",
 ]

@@ -10,10 +10,10 @@ or nobody sees the body for a time, the errors of a rig make steps of their own,
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from psotrack.tracking.camera_errors.variance_components import FittedPlaces
 
@@ -49,16 +49,20 @@ class Knock:
     clear: float
 
 
-def find_knock(parts: Iterable[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]) -> Knock | None:
+def find_knock(
+    parts: Iterable[tuple[FittedPlaces, Bool[np.ndarray, "rows cameras"], Int[np.ndarray, "rows"]]],
+) -> Knock | None:
     """The clearest knock of a camera; None if there is none.
 
     A knock of one camera shows in the others, too, and most clearly in itself. Of two cameras nothing tells which it
     is: it may be the other one.
 
     Args:
-        parts: residuals and derivatives of some frames after the other, and (rows,) the number of each row's frame.
+        parts: of some frames after the other, residuals and derivatives of all that the cameras show; (rows, cameras),
+            whether the place of a body follows from it, which says where the other cameras put the body; (rows,) the
+            number of each row's frame.
     """
-    told = [_of_cameras(places.only(places.determined), frame[places.determined]) for places, frame in parts]
+    told = [_of_cameras(*part) for part in parts]
     found: list[Knock] = []
     for camera, of_parts in enumerate(zip(*told, strict=True)):
         frames, equations, shown = (np.concatenate(each) for each in zip(*of_parts, strict=True))
@@ -71,17 +75,24 @@ def find_knock(parts: Iterable[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]) ->
 _Told = tuple[Int[np.ndarray, "frames"], Float[np.ndarray, "frames 2 3"], Float[np.ndarray, "frames cameras"]]
 
 
-def _of_cameras(places: FittedPlaces, frame: Int[np.ndarray, "rows"]) -> list[_Told]:
-    return [_against_others(places, frame, camera) for camera in range(places.shown.shape[1])]
+def _of_cameras(
+    places: FittedPlaces, counts: Bool[np.ndarray, "rows cameras"], frame: Int[np.ndarray, "rows"]
+) -> list[_Told]:
+    told = []
+    for camera in range(counts.shape[1]):
+        shown = counts.copy()
+        shown[:, camera] = places.shown[:, camera]
+        one = replace(places, shown=shown)
+        rows = np.flatnonzero(shown[:, camera] & one.determined)
+        told.append(_against_others(one.only(rows), frame[rows], camera))
+    return told
 
 
-def _against_others(places: FittedPlaces, frame: Int[np.ndarray, "rows"], camera: int) -> _Told:
-    """What is told of one camera.
+def _against_others(used: FittedPlaces, frame: Int[np.ndarray, "rows"], camera: int) -> _Told:
+    """What is told of one camera, by rows in which it shows something.
 
     The positions are eliminated: the left side is the part of the unit matrix that no position explains.
     """
-    rows = np.flatnonzero(places.shown[:, camera])
-    used = places.only(rows)
     weight = used.shown.astype(float)
     normal = np.einsum("rc,rcik,rcil->rkl", weight, used.jacobian, used.jacobian)
     right = np.einsum("rc,rcik,rci->rk", weight, used.jacobian, used.residual_px)
@@ -89,7 +100,7 @@ def _against_others(places: FittedPlaces, frame: Int[np.ndarray, "rows"], camera
     solved = J @ np.linalg.inv(normal)
     left = np.eye(2) - solved @ J.swapaxes(-1, -2)
     rest_px = used.residual_px[:, camera] - np.matvec(solved, right)
-    frames, number = np.unique(frame[rows], return_inverse=True)
+    frames, number = np.unique(frame, return_inverse=True)
     equations = np.zeros((len(frames), 2, 3))
     np.add.at(equations, number, np.concatenate([left, rest_px[..., None]], axis=-1))
     shown = np.zeros((len(frames), used.shown.shape[1]))
@@ -109,7 +120,7 @@ def _steps(
     for window in _WINDOWS:
         if len(frames) < 6 * window:
             break
-        first = np.arange(window, len(frames) - window + 1)
+        first = np.arange(2 * window, len(frames) - 2 * window + 1)
         change_px, clear = _change(total[first] - total[first - window], total[first + window] - total[first])
         usual = np.sqrt(np.median(clear) / _CHI2_MEDIAN)
         dense = frames[first + window - 1] - frames[first - window] <= _DENSE * 2 * window
@@ -119,8 +130,8 @@ def _steps(
         length2 = float(change_px[best] @ change_px[best])
         sudden = float(_change(*shortest)[0] @ change_px[best])
         part = _part_that_stays(change_px[best], equations, sets, int(at))
-        begin, end = max(at - 2 * window, 0), min(at + 2 * window, len(frames))
-        longer = float(_change(total[at] - total[begin], total[end] - total[at])[0] @ change_px[best])
+        wide = total[at] - total[at - 2 * window], total[at + 2 * window] - total[at]
+        longer = float(_change(*wide)[0] @ change_px[best])
         clearly = float(np.sqrt(clear[best])) / max(float(usual), np.finfo(float).tiny)
         if (
             clearly > _CLEAR

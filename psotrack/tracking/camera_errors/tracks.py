@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors.covariances import (
@@ -83,7 +83,12 @@ class TrackErrors:
 
 
 def with_camera_errors(
-    tracks: Tracks, views: CameraViews, motion: MotionSettings, given: ErrorSettings, fps: float
+    tracks: Tracks,
+    views: CameraViews,
+    motion: MotionSettings,
+    given: ErrorSettings,
+    fps: float,
+    all_views: CameraViews | None = None,
 ) -> tuple[Tracks, TrackErrors]:
     """Tracks whose covariances are those of the noise that was found, and the systematic errors.
 
@@ -93,6 +98,8 @@ def with_camera_errors(
         motion: settings of the motion model that the tracker used.
         given: what is known of the cameras' errors beforehand.
         fps: frames per second.
+        all_views: the views with those that do not count in the tracks, which may show a knock; None: they are not
+            known.
     """
     errors = learn_camera_errors(views, fps, (motion.error_share, motion.error_time_s))
     measured_m2, filtered_m2 = (
@@ -111,14 +118,20 @@ def with_camera_errors(
         measured_covariance_m2=measured_m2 * measured[..., None, None],
         covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    knock = find_knock(_places_of_frames(views))
+    knock = find_knock(_places_of_frames(views, views if all_views is None else all_views))
     return corrected, TrackErrors(errors, systematic_covariances(views, errors, given, knock), knock)
 
 
-def _places_of_frames(views: CameraViews) -> Iterator[tuple[FittedPlaces, Int[np.ndarray, "rows"]]]:
-    """The views as rows, and the frame of each row, of some frames after the other."""
+def _places_of_frames(
+    views: CameraViews, all_views: CameraViews
+) -> Iterator[tuple[FittedPlaces, Bool[np.ndarray, "rows cameras"], Int[np.ndarray, "rows"]]]:
+    """All views as rows, which of them count, and the frame of each row, of some frames after the other."""
     first = 0
-    for part in views.parts():
+    for part, all_of_part in zip(views.parts(), all_views.parts(), strict=True):
         num_frames, num_drones = part.position_m.shape[:2]
-        yield part.places, np.repeat(np.arange(first, first + num_frames), num_drones)
+        yield (
+            all_of_part.places,
+            part.shown.reshape(-1, views.num_cameras),
+            np.repeat(np.arange(first, first + num_frames), num_drones),
+        )
         first += num_frames

@@ -19,9 +19,12 @@ from psotrack.geometry import (
     to_camera,
 )
 from psotrack.tracking.camera_errors.variance_components import FittedPlaces
+from psotrack.tracking.matching import Sightings
 
 #: Number of frames that are computed at once: those of all frames would take gigabytes for a long recording.
 _FRAMES_AT_ONCE = 1000
+#: A sighting that no track uses may be of a drone whose image is nearer than the length of the sighting.
+_REACH = 2.0
 
 
 @dataclass(frozen=True)
@@ -139,6 +142,36 @@ def views_of_places(
         parts.append((place_px[frames] - pixels, jacobian, np.where(ahead, weight[frames], 0.0)))
     linear = map(np.concatenate, zip(*parts, strict=True))
     return CameraViews(cameras, exposures, position_m, velocity_m_s, *linear)
+
+
+def with_nearest_sightings(
+    cameras: Camera,
+    place_px: Float[np.ndarray, "frames drones cameras 2"],
+    sightings: Sightings,
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+) -> Float[np.ndarray, "frames drones cameras 2"]:
+    """The drones' places, also in cameras that show a drone too far from its track to count in the track.
+
+    There the sighting counts that is nearest to the drone, and has no nearer drone.
+
+    Args:
+        cameras, place_px, position_m, velocity_m_s: as in `views_of_places`.
+        sightings: sightings of all cameras, at the instants of the places.
+    """
+    parts = []
+    for frames in _blocks(len(place_px)):
+        part, at_m = sightings[frames], position_m[frames]
+        seen_m = _seen(at_m, velocity_m_s[frames], part.exposures)
+        off_px = part.centre_px[:, None] - _visible(cameras, at_m, seen_m)[..., None, :]
+        length2 = np.nan_to_num(np.square(off_px).sum(axis=-1), nan=np.inf)
+        near = length2 < _REACH**2 * part.size_px.prod(axis=-1)[:, None]
+        near &= length2 == length2.min(axis=1, keepdims=True)
+        near &= length2 == length2.min(axis=-1, keepdims=True)
+        nearest_px = np.take_along_axis(off_px, near.argmax(axis=-1)[..., None, None], axis=3)[..., 0, :]
+        nearest_px = nearest_px + _visible(cameras, at_m, at_m[:, :, None])
+        parts.append(np.where(near.any(axis=-1, keepdims=True), nearest_px, np.nan))
+    return np.where(np.isfinite(place_px), place_px, np.concatenate(parts))
 
 
 def _blocks(num_frames: int) -> Iterator[slice]:
