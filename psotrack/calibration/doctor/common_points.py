@@ -129,17 +129,18 @@ class ExaminedFrames:
         return replace(self, sightings=self.sightings.where(kept))
 
     def matched(
-        self, rig: Rig, loose_deg: float = 0.0
+        self, rig: Rig, loose_deg: float = 0.0, least: int | None = None
     ) -> tuple[Int[np.ndarray, "groups"], Int[np.ndarray, "groups cameras"], Float[np.ndarray, "groups 3"]]:
         """Groups of sightings that may show one body: frames, indices of the sightings, -1 for none, and positions.
 
         Args:
             rig: the cameras.
             loose_deg: standard deviation of the direction of rays that a fault may cause, degrees.
+            least: smallest number of viewpoints of a group; None: `viewpoints`.
         """
         loose_px = np.tan(np.deg2rad(loose_deg)) * np.sqrt(rig.cameras.K[:, 0, 0] * rig.cameras.K[:, 1, 1])
         noise_px = np.hypot(self.sightings.noise_px, loose_px[:, None])
-        least = self.viewpoints(rig)
+        least = self.viewpoints(rig) if least is None else least
         numbers, found, places_m = [np.empty(0, int)], [np.empty((0, len(rig)), int)], [np.empty((0, 3))]
         for frame in self.frames.tolist():
             seen_px = self.sightings.centre_px[frame]

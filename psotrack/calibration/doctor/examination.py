@@ -20,7 +20,6 @@ from psotrack.calibration.doctor.common_points import (
     Corrected,
     ExaminedFrames,
     WeightedPoints,
-    linearise,
     medians,
     misfit_px,
     weigh,
@@ -29,11 +28,12 @@ from psotrack.calibration.doctor.diagnosis import Diagnosis, Finding
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
 from psotrack.geometry import Rig, project_visible
-from psotrack.tracking.camera_errors import FittedPlaces, Knock, find_knock
+from psotrack.tracking.camera_errors import Knock, find_knock, views_of_places, with_nearest_sightings
 from psotrack.tracking.matching import (
     NOISE_PX,
     NOISE_SHARE,
     Sightings,
+    by_image,
     epipolar_distance,
     wide_bounds,
 )
@@ -57,6 +57,8 @@ MIN_SHARE = 0.3
 SUSPECT_SHARE, NOTHING_EXPLAINED, NEAR_STD = 0.5, 0.15, 3.7
 #: Smallest number of points of the other cameras with which a camera is checked.
 MIN_POINTS_OF_CAMERA = 30
+#: Largest number of frames in which a knock is looked for: of a longer video, every second, third, ...
+MOST_FRAMES = 3000
 #: Smallest number of points with which a rig can be checked.
 MIN_POINTS = 12
 #: Smallest fraction of matched sightings that go on from frame to frame: of boxes of bodies nine in ten do, of matches
@@ -116,7 +118,7 @@ def examine(
         findings.append(unknown)
     else:
         sound = seen
-        knock = _find_knock(rig, seen, data)
+        knock = _find_knock(rig, seen)
         if knock is not None:
             both = rig.names if seen.viewpoints(rig) < 3 else (rig.names[knock.camera],)
             findings.append(diagnosis.describe_knock(both, knock, fps))
@@ -160,20 +162,24 @@ def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chose
     return frames[frames < num_frames]
 
 
-def _find_knock(rig: Rig, seen: ExaminedFrames, data: WeightedPoints) -> Knock | None:
-    """A camera that was knocked in mid-flight: in the examined frames, then in all frames between the runs there."""
-
-    def knock_in(data: WeightedPoints) -> Knock | None:
-        slopes = linearise(Corrected(rig, np.zeros(len(rig))), data.points, data.position_m)
-        residual_px, is_used = np.nan_to_num(slopes.residual_px), data.used
-        return find_knock([(FittedPlaces(residual_px, slopes.by_point, is_used), is_used, data.points.frame)])
-
-    knock = knock_in(data)
-    if knock is None:
-        return None
-    last = seen.frames[seen.frames < knock.frame].max(initial=0)
-    closer = replace(seen, frames=np.union1d(seen.frames, np.arange(last, knock.frame)))
-    return knock_in(weigh(Corrected(rig, np.zeros(len(rig))), closer.common_points(rig))) or knock
+def _find_knock(rig: Rig, seen: ExaminedFrames) -> Knock | None:
+    """A camera that was knocked in mid-flight: by where pairs of cameras, or more, put the bodies in all frames."""
+    step = -(-seen.sightings.num_frames // MOST_FRAMES)
+    every = replace(seen, frames=np.arange(0, seen.sightings.num_frames, step))
+    sightings = seen.sightings[every.frames]
+    frame, box, places_m = every.matched(rig, least=2)
+    number = frame // step
+    position_m = by_image(number, places_m, len(every.frames))
+    seen_px = sightings.centre_px[number[:, None], np.arange(len(rig)), box]
+    used_px = by_image(number, np.where(box[..., None] >= 0, seen_px, np.nan), len(every.frames))
+    at_rest = np.zeros_like(position_m)
+    all_px = with_nearest_sightings(rig.cameras, used_px, sightings, position_m, at_rest)
+    used, shown = (
+        views_of_places(rig.cameras, places_px, np.ones(places_px.shape), position_m, at_rest)
+        for places_px in (used_px, all_px)
+    )
+    knock = find_knock(used, shown)
+    return None if knock is None else replace(knock, frame=knock.frame * step)
 
 
 def _find_faults(

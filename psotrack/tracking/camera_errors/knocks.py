@@ -9,13 +9,14 @@ or nobody sees the body for a time, the errors of a rig make steps of their own,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.tracking.camera_errors.variance_components import FittedPlaces
+from psotrack.tracking.camera_errors.views import CameraViews
 
 #: Numbers of frames of the windows that are compared.
 _WINDOWS = (10, 20, 40, 80)
@@ -49,20 +50,22 @@ class Knock:
     clear: float
 
 
-def find_knock(
-    parts: Iterable[tuple[FittedPlaces, Bool[np.ndarray, "rows cameras"], Int[np.ndarray, "rows"]]],
-) -> Knock | None:
+def find_knock(views: CameraViews, all_views: CameraViews) -> Knock | None:
     """The clearest knock of a camera; None if there is none.
 
     A knock of one camera shows in the others, too, and most clearly in itself. Of two cameras nothing tells which it
     is: it may be the other one.
 
     Args:
-        parts: of some frames after the other, residuals and derivatives of all that the cameras show; (rows, cameras),
-            whether the place of a body follows from it, which says where the other cameras put the body; (rows,) the
-            number of each row's frame.
+        views: the views that say where the other cameras put the bodies.
+        all_views: all that the cameras show of these bodies.
     """
-    told = [_of_cameras(*part) for part in parts]
+    told, first = [], 0
+    for counts, part in zip(views.parts(), all_views.parts(), strict=True):
+        num_frames, num_drones = part.position_m.shape[:2]
+        frame = np.repeat(np.arange(first, first + num_frames), num_drones)
+        told.append(_of_cameras(part.places, counts.places.shown, frame))
+        first += num_frames
     found: list[Knock] = []
     for camera, of_parts in enumerate(zip(*told, strict=True)):
         frames, equations, shown = (np.concatenate(each) for each in zip(*of_parts, strict=True))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors.covariances import (
@@ -19,7 +19,6 @@ from psotrack.tracking.camera_errors.covariances import (
 )
 from psotrack.tracking.camera_errors.knocks import Knock, find_knock
 from psotrack.tracking.camera_errors.learning import CameraErrors, learn_camera_errors
-from psotrack.tracking.camera_errors.variance_components import FittedPlaces
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.trajectories import Status, Tracks, Trajectories
 
@@ -118,20 +117,5 @@ def with_camera_errors(
         measured_covariance_m2=measured_m2 * measured[..., None, None],
         covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    knock = find_knock(_places_of_frames(views, views if all_views is None else all_views))
+    knock = find_knock(views, views if all_views is None else all_views)
     return corrected, TrackErrors(errors, systematic_covariances(views, errors, given, knock), knock)
-
-
-def _places_of_frames(
-    views: CameraViews, all_views: CameraViews
-) -> Iterator[tuple[FittedPlaces, Bool[np.ndarray, "rows cameras"], Int[np.ndarray, "rows"]]]:
-    """All views as rows, which of them count, and the frame of each row, of some frames after the other."""
-    first = 0
-    for part, all_of_part in zip(views.parts(), all_views.parts(), strict=True):
-        num_frames, num_drones = part.position_m.shape[:2]
-        yield (
-            all_of_part.places,
-            part.shown.reshape(-1, views.num_cameras),
-            np.repeat(np.arange(first, first + num_frames), num_drones),
-        )
-        first += num_frames
