@@ -288,7 +288,9 @@ def warn_of_blind_cameras(run: Run, tracks: Tracks, shown: Bool[np.ndarray, "fra
     exposures = None if run.silhouettes is None else run.silhouettes.exposures
     there = run.recording.timeline().is_there if exposures is None else np.asarray(exposures.is_there)
     should = in_view.any(axis=1) & there
-    for name, of_camera, is_shown in zip(run.recording.rig.names, should.T, shown.any(axis=1).T, strict=True):
+    for name, of_camera, is_shown in zip(
+        run.recording.rig.names, should.T, np.asarray(shown.any(axis=1)).T, strict=True
+    ):
         instants = np.flatnonzero(of_camera)
         blind = ~is_shown[instants]
         # A camera that is turned away, or goes blind, does so at some instant.
