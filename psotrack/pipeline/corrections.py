@@ -16,7 +16,7 @@ from psotrack.geometry import viewpoints
 from psotrack.pipeline.inputs import Run
 from psotrack.recordings import Recording, Timing
 from psotrack.settings import BLOBS
-from psotrack.tracking.camera_errors import Knock
+from psotrack.tracking.camera_errors import ClockStep, Knock
 from psotrack.tracking.matching import from_silhouettes
 from psotrack.trajectories import Tracks
 
@@ -81,6 +81,20 @@ def advise_on_clocks(run: Run, tracks: Tracks) -> None:
             1e3 * clocks.offset_std_s[worst],
             "late" if clocks.late_s[worst] > 0 else "early",
         )
+
+
+def warn_of_clock_step(run: Run, step: ClockStep) -> None:
+    """Warn of a camera whose clock steps during the recording."""
+    logger.warning(
+        "camera %s: from frame %d (%.2f s) on, its video is %.0f ms %s than before, as if it had %s; --clocks auto "
+        "takes the clocks from the data",
+        run.recording.rig.names[step.camera],
+        step.frame,
+        run.recording.timeline().time_s[step.frame],
+        1e3 * abs(step.step_s),
+        "earlier" if step.step_s > 0 else "later",
+        "lost frames" if step.step_s > 0 else "repeated frames",
+    )
 
 
 def with_clocks(recording: Recording, clocks: CameraClocks) -> Recording:

@@ -35,6 +35,7 @@ from psotrack.foreground.silhouettes import (
 from psotrack.pipeline.corrections import (
     advise_on_clocks,
     estimate_clocks,
+    warn_of_clock_step,
     warn_of_unknown_clocks,
     with_clocks,
     without_knocked,
@@ -203,6 +204,8 @@ def _track(
         run, result = _at_speed_of_tracks(run, _result_of(run, by_swarm.get(run), report), report)
         knock = None if result.errors is None else result.errors.knock
         rest = None if knock is None else without_knocked(run, knock)
+        if given.clocks == "given" and result.errors is not None and result.errors.clock_step is not None:
+            warn_of_clock_step(run, result.errors.clock_step)
         if knock is not None and rest is not None:
             ((again, result),) = _track(rest, silhouettes, [given], parts, report)
             run = replace(again, knocks=(knock, *again.knocks))

@@ -24,7 +24,6 @@ from psotrack.geometry import (
     Camera,
     Rig,
     has_image,
-    project,
     project_with_jacobian,
     to_camera,
     triangulate_linearly,
@@ -114,20 +113,6 @@ def camera_offsets(
     std_frames, white_std_frames = _standard_deviations(system, max_offset_frames)
     shown = white_std_frames < _SHOWN * max_offset_frames
     return CameraOffsets(system.offset_frames, std_frames, white_std_frames, shown)
-
-
-def misfits(
-    cameras: Camera,
-    points_px: Float[np.ndarray, "frames drones cameras 2"],
-    offset_frames: Float[np.ndarray, "cameras"],
-) -> Float[np.ndarray, "frames"]:
-    """(frames,), how badly the detections meet in points at given offsets: robust sums, 1 for a detection far off."""
-    seen_px = _interpolate_at_common_times(points_px, offset_frames)
-    point_m = triangulate_linearly(cameras, seen_px)
-    e = seen_px - project(cameras, np.nan_to_num(point_m)[:, :, None])[0]
-    there = np.isfinite(e).all(axis=-1) & np.isfinite(point_m).all(axis=-1)[..., None]
-    there &= there.sum(axis=-1, keepdims=True) >= 2
-    return (there - _robust_weights(np.where(there[..., None], e, 0.0), there)).sum(axis=(1, 2))
 
 
 @dataclass(frozen=True)

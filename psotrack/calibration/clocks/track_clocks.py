@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.clocks.camera_clocks import camera_offsets, misfits
+from psotrack.calibration.clocks.camera_clocks import camera_offsets
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import NEAR_M, Camera, Rig, project
 from psotrack.recordings import FrameTimes, Timeline
 from psotrack.support import finite_or_none
+from psotrack.tracking.camera_errors import ClockStep, find_change, views_of_places
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings
 from psotrack.trajectories import Status, Tracks, Trajectories
 from psotrack.trajectories.resampling import interpolated
@@ -43,8 +44,6 @@ _CLEARLY = 5.0
 _KNOWN = 0.25
 #: A step is a whole number of the camera's frames, up to this share of one; and largest number of steps that are found.
 _WHOLE, _MOST_STEPS = 0.25, 6
-#: Least number of stretches that tell a step from a drift; a shorter recording has shorter ones.
-_STRETCHES_OF_STEP = 4
 
 
 @dataclass(frozen=True)
@@ -151,8 +150,28 @@ def clocks_of_tracks(
         np.where(found, values, np.nan).astype(np.float64)
         for values in (tracks.position_m, tracks.velocity_m_s)
     )
-    places = places_of_tracks(rig.cameras, sightings, timeline, position_m, velocity_m_s, silhouettes)
-    return estimate_clocks(rig, places, timeline)
+    places_px = places_of_tracks(rig.cameras, sightings, timeline, position_m, velocity_m_s, silhouettes)
+    lost: list[LostFrames] = []
+    while len(lost) < _MOST_STEPS:
+        views = views_of_places(rig.cameras, places_px, np.ones(places_px.shape), position_m, velocity_m_s)
+        step = find_change(views, views, timeline.rate_hz)
+        found = _lost_frames(timeline, step) if isinstance(step, ClockStep) else None
+        if step is None or found is None:
+            break
+        lost.append(found)
+        places_px = _as_exposed(places_px, timeline, step.camera, step.frame, found.step_s)
+    return replace(estimate_clocks(rig, places_px, timeline), lost=tuple(lost))
+
+
+def _lost_frames(timeline: Timeline, step: ClockStep) -> LostFrames | None:
+    """The frames that were lost in a step; None of a step that is no whole number of frames."""
+    ends = np.flatnonzero(timeline.frame[:, step.camera] >= 0)[[0, -1]]
+    interval_s = float(np.ptp(timeline.time_s[ends]) / np.ptp(timeline.frame[ends, step.camera]))
+    count = round(step.step_s / interval_s)
+    if count < 1 or abs(step.step_s / interval_s - count) > _WHOLE:
+        return None
+    frame = int(timeline.frame[step.frame, step.camera])
+    return LostFrames(step.camera, frame, count, count * interval_s)
 
 
 def places_of_tracks(
@@ -278,31 +297,15 @@ def _interpolate(places_px: Float[np.ndarray, "instants drones 2"], timeline: Ti
 def estimate_clocks(
     rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline
 ) -> CameraClocks:
-    """Estimate offset and drift of each camera's clock, and the frames that it lost, from matched sightings.
+    """Estimate offset and drift of each camera's clock from matched sightings.
 
     Args:
         rig: the calibrated cameras.
         points_px: (instants, drones, cameras, 2), matched sightings at the instants (see `places_of_tracks`).
         timeline: the instants.
     """
-    lost: list[LostFrames] = []
-    of_step = min(_LEAST_INSTANTS, len(points_px) // _STRETCHES_OF_STEP)
-    is_long = of_step >= _LEAST_INSTANTS // 2
-    while True:
-        stretches = _offsets_of_stretches(rig, points_px, timeline, _LEAST_INSTANTS)
-        step = None
-        if is_long and len(lost) < _MOST_STEPS:
-            shorter = of_step < _LEAST_INSTANTS
-            step = _most_certain_step(
-                _offsets_of_stretches(rig, points_px, timeline, of_step) if shorter else stretches
-            )
-        found = None if step is None else _lost_frames(rig, points_px, timeline, step)
-        if found is None:
-            clocks = fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
-            return replace(clocks, lost=tuple(lost))
-        instant, frames = found
-        points_px = _as_exposed(points_px, timeline, frames.camera, instant, frames.step_s)
-        lost.append(frames)
+    stretches = _offsets_of_stretches(rig, points_px, timeline, _LEAST_INSTANTS)
+    return fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
 
 
 class _Stretches(NamedTuple):
@@ -332,67 +335,6 @@ def _offsets_of_stretches(
     std_s = np.where(shown, larger * (white / timeline.rate_hz), np.inf)
     time_s = np.array([timeline.time_s[part].mean() for part in parts])
     return _Stretches(time_s, offset / timeline.rate_hz, std_s)
-
-
-class _Step(NamedTuple):
-    """A camera whose clock is `jump_s` later from some stretch on; offsets of all cameras before it, seconds.
-
-    `scatter` is how much the offsets of the stretches are off a step there, in their standard deviations.
-    """
-
-    camera: int
-    before_s: Float[np.ndarray, "cameras"]
-    jump_s: float
-    scatter: float
-
-
-def _most_certain_step(stretches: _Stretches) -> _Step | None:
-    """The step of a clock that the stretches show best; None where no step fits better than even clocks.
-
-    The stretch with the step has no offset of its own, so it is left out of both fits.
-    """
-    time_s, offset_s, std_s = stretches
-    number, steps = np.arange(len(time_s)), list[_Step]()
-    for middle in number[1:-1]:
-        others_s = np.where((number == middle)[:, None], np.inf, std_s)
-        step, line = (
-            _fit(np.stack([np.ones(len(number)), change], axis=-1), offset_s, others_s)
-            for change in (number > middle, time_s - time_s.mean())
-        )
-        # Of two cameras, that which is later afterwards has lost frames.
-        jump_s = step.coefficients[:, 1] - np.sort(step.coefficients[:, 1])[(offset_s.shape[1] - 1) // 2]
-        certainty = np.divide(jump_s, step.std[:, 1], out=np.zeros(len(jump_s)), where=step.std[:, 1] > 0)
-        camera = int(certainty.argmax())
-        if step.scatter < line.scatter and certainty[camera] > _CLEARLY:
-            steps.append(_Step(camera, step.coefficients[:, 0], float(jump_s[camera]), step.scatter))
-    return min(steps, key=lambda step: step.scatter, default=None)
-
-
-def _lost_frames(
-    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline, step: _Step
-) -> tuple[int, LostFrames] | None:
-    """The instant of a step, and the frames that were lost; None of a step that is no whole number of frames."""
-    camera, before_s = step.camera, step.before_s
-    shown = np.flatnonzero(timeline.frame[:, camera] >= 0)
-    ends = shown[[0, -1]]
-    interval_s = float(np.ptp(timeline.time_s[ends]) / np.ptp(timeline.frame[ends, camera]))
-    count = int(np.rint(step.jump_s / interval_s))
-    if count < 1 or abs(step.jump_s / interval_s - count) > _WHOLE:
-        return None
-    step_s = count * interval_s
-    after_s = before_s + step_s * (np.arange(len(rig)) == camera)
-    before, after = (misfits(rig.cameras, points_px, each * timeline.rate_hz) for each in (before_s, after_s))
-    # Before about this instant the clock as it was fits better, from it on the one that is later.
-    about = int(np.append(0.0, np.cumsum(before - after)).argmin())
-
-    def misfit(instant: int) -> float:
-        moved_px = _as_exposed(points_px, timeline, camera, instant, step_s)
-        return float(misfits(rig.cameras, moved_px, before_s * timeline.rate_hz).sum())
-
-    reach = 1 + round(step_s * timeline.rate_hz)
-    best = min(range(max(about - reach, 0), about + reach + 1), key=misfit)
-    instant = int(shown[np.clip(np.searchsorted(shown, best), 0, len(shown) - 1)])
-    return instant, LostFrames(camera, int(timeline.frame[instant, camera]), count, step_s)
 
 
 def _as_exposed(

@@ -26,7 +26,7 @@ from psotrack.geometry import (
     viewpoints,
 )
 from psotrack.geometry.estimation import cauchy_weight
-from psotrack.tracking.camera_errors import Knock
+from psotrack.tracking.camera_errors import ClockStep, Knock
 from psotrack.tracking.matching import BORDER_PX, Sightings, are_near, by_image, match
 
 #: Standard deviation of the direction of a camera's rays that a fault may cause, degrees.
@@ -122,10 +122,10 @@ class ExaminedFrames:
         chosen = None if exposures is None else exposures.of_cameras(np.array(index))
         return replace(self, sightings=self.sightings.with_arrays(lambda values: values[:, index], chosen))
 
-    def without(self, knock: Knock) -> ExaminedFrames:
-        """What is seen before a camera was knocked, and by the others then."""
+    def without(self, change: Knock | ClockStep) -> ExaminedFrames:
+        """What is seen before a camera changed, and by the others then."""
         kept = np.ones(self.sightings.noise_px.shape, bool)
-        kept[knock.frame :, knock.camera] = False
+        kept[change.frame :, change.camera] = False
         return replace(self, sightings=self.sightings.where(kept))
 
     def matched(

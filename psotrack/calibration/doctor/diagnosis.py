@@ -13,7 +13,7 @@ from psotrack.calibration.doctor.common_points import Corrected
 from psotrack.calibration.doctor.fault_search import FoundFault, Judged
 from psotrack.geometry import Camera, Rig
 from psotrack.support import finite_or_none, html_block, html_table, text_table
-from psotrack.tracking.camera_errors import Knock
+from psotrack.tracking.camera_errors import ClockStep, Knock
 
 #: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to
 #: 0.15 m.
@@ -76,13 +76,17 @@ def describe_disagreement(
     return Finding("no agreement", (), message, remedy)
 
 
-def describe_knock(names: tuple[str, ...], knock: Knock, fps: float) -> Finding:
-    """Describe a camera, or one of two, that was knocked in mid-flight."""
-    message = (
-        f"camera {' or '.join(names)}: it was knocked at frame {knock.frame} ({knock.frame / fps:.2f} s), which moves "
-        f"its boxes by {np.linalg.norm(knock.shift_px):.0f} px from then on"
-    )
-    return Finding("knocked", names, message, f"before the next flight, {_PLACE_ANEW}")
+def describe_change(names: tuple[str, ...], change: Knock | ClockStep, fps: float) -> Finding:
+    """Describe a camera, or one of two, that changed in mid-flight."""
+    who, at = f"camera {' or '.join(names)}", f"frame {change.frame} ({change.frame / fps:.2f} s)"
+    if isinstance(change, Knock):
+        off_px = np.linalg.norm(change.shift_px)
+        message = f"{who}: it was knocked at {at}, which moves its boxes by {off_px:.0f} px from then on"
+        return Finding("knocked", names, message, f"before the next flight, {_PLACE_ANEW}")
+    early, as_if = ("earlier", "lost frames") if change.step_s > 0 else ("later", "repeated frames")
+    by_ms = 1e3 * abs(change.step_s)
+    message = f"{who}: from {at} on, its video is {by_ms:.0f} ms {early} than before, as if it had {as_if}"
+    return Finding("clock step", names, message, "track with --clocks auto, or give the times of its frames")
 
 
 def describe_gross_fault(explained: float, name: str) -> Finding:

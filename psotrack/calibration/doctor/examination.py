@@ -28,7 +28,13 @@ from psotrack.calibration.doctor.diagnosis import Diagnosis, Finding
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
 from psotrack.geometry import Rig, project_visible
-from psotrack.tracking.camera_errors import Knock, find_knock, views_of_places, with_nearest_sightings
+from psotrack.tracking.camera_errors import (
+    ClockStep,
+    Knock,
+    find_change,
+    views_of_places,
+    with_nearest_sightings,
+)
 from psotrack.tracking.matching import (
     NOISE_PX,
     NOISE_SHARE,
@@ -57,8 +63,10 @@ MIN_SHARE = 0.3
 SUSPECT_SHARE, NOTHING_EXPLAINED, NEAR_STD = 0.5, 0.15, 3.7
 #: Smallest number of points of the other cameras with which a camera is checked.
 MIN_POINTS_OF_CAMERA = 30
-#: Largest number of frames in which a knock is looked for: of a longer video, every second, third, ...
+#: Largest number of frames in which a change is looked for: of a longer video, every second, third, ...
 MOST_FRAMES = 3000
+#: Velocities are those over twice this time, seconds.
+VELOCITY_S = 0.1
 #: Smallest number of points with which a rig can be checked.
 MIN_POINTS = 12
 #: Smallest fraction of matched sightings that go on from frame to frame: of boxes of bodies nine in ten do, of matches
@@ -118,11 +126,11 @@ def examine(
         findings.append(unknown)
     else:
         sound = seen
-        knock = _find_knock(rig, seen)
-        if knock is not None:
-            both = rig.names if seen.viewpoints(rig) < 3 else (rig.names[knock.camera],)
-            findings.append(diagnosis.describe_knock(both, knock, fps))
-            sound = seen.without(knock)
+        change = _find_change(rig, seen)
+        if change is not None:
+            both = rig.names if seen.viewpoints(rig) < 3 else (rig.names[change.camera],)
+            findings.append(diagnosis.describe_change(both, change, fps))
+            sound = seen.without(change)
             points = sound.common_points(rig)
             data = weigh(as_read, points)
         lags = find_lags(rig, data)
@@ -162,24 +170,41 @@ def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chose
     return frames[frames < num_frames]
 
 
-def _find_knock(rig: Rig, seen: ExaminedFrames) -> Knock | None:
-    """A camera that was knocked in mid-flight: by where pairs of cameras, or more, put the bodies in all frames."""
+def _find_change(rig: Rig, seen: ExaminedFrames) -> Knock | ClockStep | None:
+    """A camera that changes in mid-flight, by where pairs of cameras, or more, put the bodies in all frames."""
     step = -(-seen.sightings.num_frames // MOST_FRAMES)
     every = replace(seen, frames=np.arange(0, seen.sightings.num_frames, step))
-    sightings = seen.sightings[every.frames]
+    sightings, rate_hz = seen.sightings[every.frames], seen.fps / step
     frame, box, places_m = every.matched(rig, least=2)
     number = frame // step
     position_m = by_image(number, places_m, len(every.frames))
     seen_px = sightings.centre_px[number[:, None], np.arange(len(rig)), box]
     used_px = by_image(number, np.where(box[..., None] >= 0, seen_px, np.nan), len(every.frames))
-    at_rest = np.zeros_like(position_m)
-    all_px = with_nearest_sightings(rig.cameras, used_px, sightings, position_m, at_rest)
+    velocity_m_s = _velocities(position_m, rate_hz)
+    all_px = with_nearest_sightings(rig.cameras, used_px, sightings, position_m, np.zeros_like(position_m))
     used, shown = (
-        views_of_places(rig.cameras, places_px, np.ones(places_px.shape), position_m, at_rest)
+        views_of_places(rig.cameras, places_px, np.ones(places_px.shape), position_m, velocity_m_s)
         for places_px in (used_px, all_px)
     )
-    knock = find_knock(used, shown)
-    return None if knock is None else replace(knock, frame=knock.frame * step)
+    change = find_change(used, shown, rate_hz)
+    return None if change is None else replace(change, frame=change.frame * step)
+
+
+def _velocities(
+    position_m: Float[np.ndarray, "frames bodies 3"], rate_hz: float
+) -> Float[np.ndarray, "frames bodies 3"]:
+    """Velocities from the nearest places a little earlier and later, m/s; 0 where there is none."""
+    apart = max(1, round(VELOCITY_S * rate_hz))
+    near_m = []
+    for there in (-apart, apart):
+        other_m = np.full_like(position_m, np.nan)
+        other_m[max(-there, 0) : len(other_m) - max(there, 0)] = position_m[max(there, 0) :][
+            : len(other_m) - apart
+        ]
+        distance_m = np.linalg.norm(position_m[:, :, None] - other_m[:, None], axis=-1)
+        nearest = np.nan_to_num(distance_m, nan=np.inf).argmin(axis=-1)
+        near_m.append(np.take_along_axis(other_m, nearest[..., None], axis=1))
+    return np.nan_to_num((near_m[1] - near_m[0]) * rate_hz / (2 * apart))
 
 
 def _find_faults(

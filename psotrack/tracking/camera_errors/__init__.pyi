@@ -1,3 +1,4 @@
+from .changes import ClockStep, Knock, find_change
 from .constant_errors import ConstantErrors, fit_constant_errors
 from .covariances import (
     MeasurementErrors,
@@ -7,7 +8,6 @@ from .covariances import (
     noise_ratios,
     systematic_covariances,
 )
-from .knocks import Knock, find_knock
 from .learning import Autocorrelation, CameraErrors, autocorrelation_of, learn_camera_errors
 from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
@@ -17,6 +17,7 @@ __all__ = [
     "Autocorrelation",
     "CameraErrors",
     "CameraViews",
+    "ClockStep",
     "ConstantErrors",
     "FittedPlaces",
     "Knock",
@@ -26,7 +27,7 @@ __all__ = [
     "autocorrelation_of",
     "camera_variances",
     "filtered_variances",
-    "find_knock",
+    "find_change",
     "fit_constant_errors",
     "learn_camera_errors",
     "noise_covariance",

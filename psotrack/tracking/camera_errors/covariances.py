@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from scipy.linalg import solve_discrete_are
 
 from psotrack.settings import ErrorSettings, MotionSettings
-from psotrack.tracking.camera_errors.knocks import Knock
+from psotrack.tracking.camera_errors.changes import Knock
 from psotrack.tracking.camera_errors.learning import CameraErrors
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.tracking.motion import white_jerk_noise

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Int
 
 from psotrack.settings import ErrorSettings, MotionSettings
+from psotrack.tracking.camera_errors.changes import ClockStep, Knock, find_change
 from psotrack.tracking.camera_errors.covariances import (
     SystematicCovariances,
     noise_covariance,
     noise_ratios,
     systematic_covariances,
 )
-from psotrack.tracking.camera_errors.knocks import Knock, find_knock
 from psotrack.tracking.camera_errors.learning import CameraErrors, learn_camera_errors
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.trajectories import Status, Tracks, Trajectories
@@ -34,11 +34,13 @@ class TrackErrors:
         cameras: errors of the cameras.
         systematic: covariances of the positions by systematic errors, which the tracks' covariances do not contain.
         knock: a camera that was knocked during the recording, which they do contain; None for no camera.
+        clock_step: a camera whose clock steps during the recording; None for no camera.
     """
 
     cameras: CameraErrors
     systematic: SystematicCovariances
     knock: Knock | None = None
+    clock_step: ClockStep | None = None
 
     def smoothing(self, motion: MotionSettings) -> MotionSettings:
         """Settings of the motion model with noise that fades as it was found to."""
@@ -117,5 +119,8 @@ def with_camera_errors(
         measured_covariance_m2=measured_m2 * measured[..., None, None],
         covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    knock = find_knock(views, views if all_views is None else all_views)
-    return corrected, TrackErrors(errors, systematic_covariances(views, errors, given, knock), knock)
+    change = find_change(views, views if all_views is None else all_views, fps)
+    knock = change if isinstance(change, Knock) else None
+    clock_step = change if isinstance(change, ClockStep) else None
+    systematic = systematic_covariances(views, errors, given, knock)
+    return corrected, TrackErrors(errors, systematic, knock, clock_step)
