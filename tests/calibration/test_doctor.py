@@ -98,6 +98,13 @@ def knocked(seen, name, frame, shift_px):
     return {**seen, name: replace(boxes, xyxy=boxes.xyxy + after * np.tile(shift_px, 2))}
 
 
+def without_frame(seen, name, frame):
+    """Detections of which one camera lost a frame, and counts on."""
+    boxes = seen[name]
+    kept, number = boxes.frame != frame, boxes.frame - (boxes.frame > frame)
+    return {**seen, name: Detections(number[kept], boxes.xyxy[kept], boxes.confidence[kept])}
+
+
 def moved(rig, index, shift_m):
     t_m = rig.cameras.T_cam_world[:, :3, 3].copy()
     t_m[index] += shift_m
@@ -230,14 +237,7 @@ def test_two_cameras_are_checked(cameras, of_third):
     assert set(finding.cameras) >= set(two)
 
 
-OUTDOORS = {
-    "outdoors": True,
-    "cameras": 3,
-    "drones": 1,
-    "frames": 400,
-    "noise_share": 0.0,
-    "false_alarms": 0.0,
-}
+OUTDOORS = {"outdoors": True, "cameras": 3, "drones": 1, "frames": 400, "noise_share": 0, "false_alarms": 0}
 
 
 def all_turned(rig, degrees):
@@ -294,16 +294,27 @@ def test_a_knocked_camera_is_left_out_of_tracks_or_widens_their_covariances(tmp_
         caplog.clear()
 
 
+def test_a_camera_that_loses_a_frame_is_named_with_the_frame(tmp_path, caplog):
+    """By the doctor and by `track`; they were silent, or said that the camera was knocked."""
+    world = World(cameras=3, drones=1, size=0.4, frames=200)
+    seen = without_frame(world.seen, "cam2", 120)
+    (finding,) = world.examined(seen=seen).findings
+    assert (finding.kind, finding.cameras) == ("clock step", ("cam2",))
+    pt.track(record_detections(tmp_path / "world", seen, world.rig), method="projection-lines")
+    for said in (finding.message, caplog.text):
+        found = re.search(r"from frame (\d+) \(.* on, its video is (\d+) ms earlier .* lost frames", said)
+        assert abs(int(found[1]) - 120) <= 1
+        assert abs(int(found[2]) - 1e3 / FPS) < 8
+
+
 def test_errors_that_last_look_like_no_turn():
     """Sound rigs of three cameras and one body, whose errors of several pixels last for about a second."""
-    world = World(4, noise_px=2.5, lasting=0.98, **OUTDOORS)
-    assert world.examined().findings == ()
+    assert World(4, noise_px=2.5, lasting=0.98, **OUTDOORS).examined().findings == ()
 
 
 def test_far_cameras_that_see_bodies_of_plausible_size_are_no_wrong_unit():
     """Cameras hundreds of metres apart that see a drone: metres, not millimetres."""
-    world = World(far=60.0, drones=1, frames=40, size=4.0)
-    assert world.examined().findings == ()
+    assert World(far=60.0, drones=1, frames=40, size=4.0).examined().findings == ()
 
 
 # The cases of the study.
@@ -325,12 +336,7 @@ def test_a_sound_rig_is_left_alone(number):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "fault", "cameras"),
-    [
-        (4, "exchanged", 3),
-        (5, "turned 1", None),
-        (1, "moved 5 cm", 3),
-        (2, "turned 0.5", 3),
-    ],
+    [(4, "exchanged", 3), (5, "turned 1", None), (1, "moved 5 cm", 3), (2, "turned 0.5", 3)],
 )
 def test_a_planted_fault_is_named(number, fault, cameras):
     case, diagnosis = diagnosed(number, fault, cameras)
