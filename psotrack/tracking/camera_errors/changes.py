@@ -32,6 +32,8 @@ _DENSE = 2.0
 #: Smallest knock, pixels of an image of 1920 columns: a calibration's own error. Smallest step of a clock, frames: a
 #: lost frame is a whole one.
 _LEAST_PX, _LEAST_FRAMES = 1.5, 0.6
+#: Part of what is told of a change along all axes that is too little along one of them.
+_LEAST_TOLD = 0.01
 #: Median of a squared length of one or two components of variance 1 (χ² distribution), by their number.
 _CHI2_MEDIAN = {1: 0.4549, 2: 1.386}
 
@@ -74,6 +76,8 @@ class _Step(NamedTuple):
     change: np.ndarray
     #: How many times as large the change is as differences between neighbouring windows usually are.
     clear: float
+    #: Squared distance of the levels before and after by what is told of them, per dimension.
+    explains: float
 
 
 def find_change(views: CameraViews, all_views: CameraViews, rate_hz: float) -> Knock | ClockStep | None:
@@ -89,7 +93,7 @@ def find_change(views: CameraViews, all_views: CameraViews, rate_hz: float) -> K
     """
     knock = _clearest_step(views, all_views, _LEAST_PX)
     late = _clearest_step(views, all_views, _LEAST_FRAMES / rate_hz, along_motion=True)
-    if late is not None and (knock is None or late.clear > knock.clear):
+    if late is not None and (knock is None or late.explains > knock.explains):
         return ClockStep(late.frame, late.camera, float(late.change[0]))
     return None if knock is None else Knock(knock.frame, knock.camera, knock.change)
 
@@ -198,7 +202,8 @@ def _steps(
                 _solved(each)[0] for each in (total[at] - total[at - window], total[at + window] - total[at])
             ]
             at = at - window + _likeliest_split(equations[at - window : at + window], *levels)
-            yield _Step(int(frames[at]), camera, change[best], clearly)
+            explains = float(clear[best]) / len(change[best])
+            yield _Step(int(frames[at]), camera, change[best], clearly, explains)
 
 
 def _part_that_stays(
@@ -250,6 +255,8 @@ def _solved(
     equations: Float[np.ndarray, "*steps dims _"],
 ) -> tuple[Float[np.ndarray, "*steps dims"], Float[np.ndarray, "*steps dims dims"]]:
     """The level, and its covariance for a noise of one pixel."""
-    # Two cameras tell a shift along one line only.
-    inverse = np.linalg.inv(equations[..., :-1] + 1e-3 * np.eye(equations.shape[-2]))
+    # Two cameras tell a shift along one line only: what is hardly told counts as no shift.
+    told = equations[..., :-1]
+    least = 1e-3 + _LEAST_TOLD * np.trace(told, axis1=-2, axis2=-1)
+    inverse = np.linalg.inv(told + least[..., None, None] * np.eye(told.shape[-1]))
     return np.matvec(inverse, equations[..., -1]), inverse
