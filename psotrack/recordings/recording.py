@@ -342,12 +342,16 @@ class Recording:
                 found=f"none for {names}",
                 remedy="make a calibration with `psotrack calibrate rig`",
             )
-        stored = any(each.silhouettes for each in without)
+        remedy = ""
+        if any(each.silhouettes for each in without):
+            remedy = "stored silhouettes do not show the images"
+        elif all(each.detections for each in without):
+            remedy = "`psotrack track --method projection-lines` needs detections only"
         return InputError(
             self.folder,
             expected=f"{'a video' if videos else 'a video, or detections,'} for each of the cameras {names}",
             found=f"none for {', '.join(each.name for each in without)}",
-            remedy="stored silhouettes do not show the images" if stored else "",
+            remedy=remedy,
         )
 
     def _first(self, num_frames: int) -> Recording:
