@@ -194,9 +194,10 @@ def _read(path: Path, refusal: Callable[..., InputError]) -> Triangles:
     try:
         # Names of parts and comments may be in any encoding; they are not used.
         file = io.StringIO(content.decode(errors="replace")) if suffix == ".obj" else io.BytesIO(content)
-        read = trimesh.load_mesh(file, file_type=suffix[1:], process=False, skip_materials=True)
-        vertices = np.asarray(read.vertices, float).reshape(-1, 3)
-        faces = np.asarray(read.faces, int).reshape(-1, 3)
+        with np.errstate(invalid="ignore"):  # damaged numbers of vertices are no vertices, see below
+            read = trimesh.load_mesh(file, file_type=suffix[1:], process=False, skip_materials=True)
+            vertices = np.asarray(read.vertices, float).reshape(-1, 3)
+            faces = np.asarray(read.faces, int).reshape(-1, 3)
     # Each parser of trimesh has different errors.
     except Exception as error:
         raise refusal(expected="a mesh", found=f"a file that cannot be read ({error})") from error
