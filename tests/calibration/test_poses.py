@@ -11,12 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.calibration import (
-    locate_camera,
-    ray_distances,
-    solve_pnp,
-    solve_pnp_ransac,
-)
+from psotrack.calibration import locate_camera, ray_distances, solve_pnp, solve_pnp_ransac
 from psotrack.geometry import look_at, make_camera, project
 
 K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
@@ -123,12 +118,7 @@ def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
 
 @pytest.mark.parametrize(
     ("noise_px", "focal", "dist"),
-    [
-        (0.3, 1.0, ()),
-        (4.0, 1.0, ()),
-        (0.3, 1.01, ()),
-        (0.3, 1.0, (-0.02, 0.01, 0, 0)),
-    ],
+    [(0.3, 1.0, ()), (4.0, 1.0, ()), (0.3, 1.01, ()), (0.3, 1.0, (-0.02, 0.01, 0, 0))],
 )
 def test_the_truth_is_where_the_covariance_says_by_any_noise_and_lens(noise_px, focal, dist):
     """The noise is learned from the residuals, also where it is small or the lens is wrong; a wrong lens is named."""

@@ -43,7 +43,9 @@ from psotrack.calibration import (
     views_of_detections,
     world_of_camera,
 )
+from psotrack.calibration.lens_models import lenses_at_size
 from psotrack.calibration.rig.start import find_board_poses, fit_boards
+from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections, FrameTimes
 
@@ -87,6 +89,17 @@ def test_known_lenses_are_kept_and_the_floor_is_the_board():
     np.testing.assert_allclose(calibrated.T_world_board[3], np.diag([1.0, -1, -1, 1]), atol=1e-9)
     np.testing.assert_array_equal(calibrated.rig.cameras.K, RIG.cameras.K)
     assert all((std == 0).all() for std in calibrated.lens_std)
+
+
+def test_lenses_of_images_of_another_size_are_rescaled_or_refused(caplog):
+    """The middle of the first pixel is at 0, so that principal points change by half a pixel, too."""
+    found = lenses_at_size(Path("lens.toml"), RIG, dict.fromkeys(RIG.names, (640, 360)))
+    middle_px = (RIG.cameras.K[:, :2, 2] + 0.5) / 2 - 0.5
+    np.testing.assert_allclose(found.cameras.K[:, :2, 2], middle_px)
+    np.testing.assert_allclose(found.cameras.K[:, 0, 0], RIG.cameras.K[:, 0, 0] / 2)
+    assert "rescaled from 1280 x 720 to 640 x 360 pixels" in caplog.text
+    with pytest.raises(InputError, match="expected images of 1280 x 720 pixels"):
+        lenses_at_size(Path("lens.toml"), RIG, dict.fromkeys(RIG.names, (640, 400)))
 
 
 @pytest.mark.slow

@@ -12,14 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.geometry import (
-    look_at,
-    make_camera,
-    project,
-    reconstruct,
-    triangulate,
-    triangulate_linearly,
-)
+from psotrack.geometry import look_at, make_camera, project, reconstruct, triangulate, triangulate_linearly
 
 
 def noisy_pixels(rig, points, seed=0, noise_px=1.0):

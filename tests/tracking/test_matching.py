@@ -5,13 +5,7 @@ from itertools import product
 import cv2
 import numpy as np
 import pytest
-from helpers import (
-    LENSES,
-    make_unnamed_rig,
-    move_world,
-    project_points,
-    ring_rig,
-)
+from helpers import LENSES, make_unnamed_rig, move_world, project_points, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares

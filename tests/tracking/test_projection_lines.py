@@ -25,6 +25,7 @@ from psotrack.tracking.births import (
     moving_points,
     room_bounds,
     state_at_first_frame,
+    with_speed_of_tracks,
 )
 from psotrack.tracking.lines.merged_boxes import PART_SHARE, split_merged_boxes
 from psotrack.tracking.matching import Sightings, from_detections, match
@@ -403,6 +404,19 @@ def see_all(rig, truth_m, *, clutter=1, **how):
 def track_in(rig, seen, volume, **settings):
     changed = {"motion.max_speed_m_s": volume.max_speed_m_s, **settings}
     return track(rig, seen, TrackSettings().changed(changed), bounds_m=volume.bounds_m)
+
+
+def test_a_speed_limit_that_nobody_gave_is_that_of_faster_tracks():
+    rig, (slow_m_s, fast_m_s) = ground_rig(4), (5.0, 9.0)
+    volume = replace(flight_volume(rig, None), bounds_m=np.array([[-20.0, -20, 0], [20, 20, 30]]))
+    for speed_m_s in (slow_m_s, fast_m_s):
+        tracks = track_in(rig, see_all(rig, flights(50, (speed_m_s,))), replace(volume, max_speed_m_s=20.0))
+        found = with_speed_of_tracks(volume, tracks, FPS)
+        limit_m_s, source = (6.0, "default") if speed_m_s == slow_m_s else (1.5 * fast_m_s, "tracks")
+        assert found.max_speed_m_s == pytest.approx(limit_m_s, rel=0.1)
+        assert (found.speed_from, found.num_faster > 30) == (source, source == "tracks")
+    told = replace(volume, speed_from="given")
+    assert with_speed_of_tracks(told, tracks, FPS) is told
 
 
 def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
