@@ -140,10 +140,14 @@ FAULTS = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_of_the_rig_is_named(name):
     rig, kind, cameras, message = FAULTS[name]
-    (finding,) = FEW.examined(rig, FEW.truth_m).findings
+    diagnosis = FEW.examined(rig, FEW.truth_m)
+    (finding,) = diagnosis.findings
     assert finding.kind == kind, finding
     assert finding.cameras == cameras, finding
     assert re.search(message, finding.message), finding.message
+    # What is said agrees with the residuals that are printed.
+    moved_px = re.search(r"moves its boxes by (\d+) px", finding.message)
+    assert moved_px is None or 0.7 < float(moved_px[1]) / np.nanmax(diagnosis.residual_px) < 1.5
 
 
 def test_an_error_that_no_single_sighting_shows_is_named():

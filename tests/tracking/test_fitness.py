@@ -17,12 +17,7 @@ from windows import best_place, camera_at, cut_at
 
 from psotrack.foreground.silhouettes import summed_area_table
 from psotrack.tracking.swarm import SoftIoU
-from psotrack.tracking.swarm.fitness import (
-    camera_scores,
-    drone_fitness,
-    joint_fitness,
-    score_inputs,
-)
+from psotrack.tracking.swarm.fitness import camera_scores, drone_fitness, joint_fitness, score_inputs
 from psotrack.tracking.swarm.vertex import SPAN, find_vertex
 
 #: 64 x 48 pixels, 20 pixels per metre: a drone of 1 m x 0.5 m at the origin covers columns 22 to 42, rows 19 to 29.
