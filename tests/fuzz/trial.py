@@ -30,8 +30,9 @@ from psotrack.errors import PsotrackError
 
 #: Longest message, characters; the folders of the tries do not count.
 LONGEST = 300
-#: What a try may take beside twice what the sound file takes.
-SECONDS, MEBIBYTES = 2.0, 256
+#: What a try may take beside twice what the sound file takes; and where a command accepts a file, whose arrays may have
+#: another shape, for which programs are compiled.
+SECONDS, MEBIBYTES, COMPILING_SECONDS = 2.0, 256, 8.0
 #: Share of the tries that run a command.
 COMMANDS = 0.05
 
@@ -144,7 +145,8 @@ class Judge:
         # Memory first: where the machine has little of it, it also takes time.
         if limit is not None and cost.mebibytes > 2 * limit.mebibytes + MEBIBYTES:
             faults.append(f"took {cost.mebibytes:.0f} MiB instead of {limit.mebibytes:.0f} MiB")
-        if limit is not None and cost.seconds > 2 * limit.seconds + SECONDS:
+        more_s = COMPILING_SECONDS if read is None and not is_refused else SECONDS
+        if limit is not None and cost.seconds > 2 * limit.seconds + more_s:
             faults.append(f"took {cost.seconds:.1f} s instead of {limit.seconds:.1f} s")
         return next(filter(None, faults), ""), is_refused, cost
 
