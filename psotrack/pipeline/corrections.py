@@ -88,13 +88,19 @@ def warn_of_clock_step(run: Run, step: ClockStep) -> None:
     logger.warning(
         "camera %s: from frame %d (%.2f s) on, its video is %.0f ms %s than before, as if it had %s; --clocks auto "
         "takes the clocks from the data",
-        run.recording.rig.names[step.camera],
+        _named(run.recording, step.camera),
         step.frame,
         run.recording.timeline().time_s[step.frame],
         1e3 * abs(step.step_s),
         "earlier" if step.step_s > 0 else "later",
         "lost frames" if step.step_s > 0 else "repeated frames",
     )
+
+
+def _named(recording: Recording, camera: int) -> str:
+    """A camera that changed, or both of two: nothing tells which of them it is."""
+    names = recording.rig.names
+    return names[camera] if len(names) > 2 else f"{names[camera]}, or {names[1 - camera]}"
 
 
 def with_clocks(recording: Recording, clocks: CameraClocks) -> Recording:
@@ -122,10 +128,9 @@ def without_knocked(run: Run, knock: Knock) -> Recording | None:
     rest = np.delete(np.arange(len(recording.rig)), knock.camera)
     enough = len(np.unique(viewpoints(recording.rig.cameras[rest]))) >= _LEAST_VIEWPOINTS
     logger.warning(
-        "camera %s%s: it was knocked at frame %d (%.2f s), and shows everything %.0f px off from then on; %s; "
+        "camera %s: it was knocked at frame %d (%.2f s), and shows everything %.0f px off from then on; %s; "
         "see `psotrack doctor %s`",
-        name,
-        "" if len(rest) > 1 else f", or {recording.rig.names[rest[0]]}",
+        _named(recording, knock.camera),
         knock.frame,
         timeline.time_s[knock.frame],
         np.linalg.norm(knock.shift_px),

@@ -139,7 +139,7 @@ def test_a_clock_that_runs_fast_is_found():
 
 @pytest.mark.parametrize(
     ("cameras", "camera", "frame", "count", "frames"),
-    [(5, 2, 140, 1, 300), (5, 4, 170, 3, 300), (2, 1, 130, 1, 300), (5, 0, 70, 1, 140)],
+    [(5, 4, 170, 3, 300), (2, 1, 130, 1, 300), (2, 0, 130, 1, 300), (5, 0, 70, 1, 140)],
 )
 def test_lost_frames_are_a_step_at_their_frame_and_no_drift(cameras, camera, frame, count, frames):
     """Found: a line through the offsets, by which most frames were off by up to half the step."""

@@ -194,17 +194,20 @@ def _velocities(
     position_m: Float[np.ndarray, "frames bodies 3"], rate_hz: float
 ) -> Float[np.ndarray, "frames bodies 3"]:
     """Velocities from the nearest places a little earlier and later, m/s; 0 where there is none."""
-    apart = max(1, round(VELOCITY_S * rate_hz))
-    near_m = []
-    for there in (-apart, apart):
-        other_m = np.full_like(position_m, np.nan)
-        other_m[max(-there, 0) : len(other_m) - max(there, 0)] = position_m[max(there, 0) :][
-            : len(other_m) - apart
-        ]
-        distance_m = np.linalg.norm(position_m[:, :, None] - other_m[:, None], axis=-1)
-        nearest = np.nan_to_num(distance_m, nan=np.inf).argmin(axis=-1)
-        near_m.append(np.take_along_axis(other_m, nearest[..., None], axis=1))
-    return np.nan_to_num((near_m[1] - near_m[0]) * rate_hz / (2 * apart))
+    apart, number = max(1, round(VELOCITY_S * rate_hz)), np.arange(len(position_m))
+    earlier, later = (np.clip(number + there, 0, len(number) - 1) for there in (-apart, apart))
+    before_m, after_m = (_nearest(position_m, position_m[there]) for there in (earlier, later))
+    per_s = rate_hz / np.maximum(later - earlier, 1)
+    return np.nan_to_num((after_m - before_m) * per_s[:, None, None])
+
+
+def _nearest(
+    position_m: Float[np.ndarray, "frames bodies 3"], other_m: Float[np.ndarray, "frames bodies 3"]
+) -> Float[np.ndarray, "frames bodies 3"]:
+    """Of the other places of each frame, the one that is nearest to each place."""
+    distance_m = np.linalg.norm(position_m[:, :, None] - other_m[:, None], axis=-1)
+    nearest = np.nan_to_num(distance_m, nan=np.inf).argmin(axis=-1)
+    return np.take_along_axis(other_m, nearest[..., None], axis=1)
 
 
 def _find_faults(

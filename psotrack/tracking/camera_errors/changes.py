@@ -113,7 +113,8 @@ def _clearest_step(
     for camera, of_parts in enumerate(zip(*told, strict=True)):
         frames, equations, shown = (np.concatenate(each) for each in zip(*of_parts, strict=True))
         found += _steps(camera, frames, equations, shown, least)
-    return max(found, key=lambda step: step.clear, default=None)
+    # Two cameras differ by as much: rather, one has lost frames than the other has repeated some.
+    return max(found, key=lambda step: (round(step.clear, 3), step.change[0]), default=None)
 
 
 #: Frames in which a camera shows something, what they tell of a change of its places, as equations [left | right], and
