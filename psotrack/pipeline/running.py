@@ -202,10 +202,11 @@ def _track(
     results = []
     for run, given in zip(runs, settings, strict=True):
         run, result = _at_speed_of_tracks(run, _result_of(run, by_swarm.get(run), report), report)
-        knock = None if result.errors is None else result.errors.knock
+        errors = result.errors
+        knock, clock_step = (None, None) if errors is None else (errors.knock, errors.clock_step)
         rest = None if knock is None else without_knocked(run, knock)
-        if given.clocks == "given" and result.errors is not None and result.errors.clock_step is not None:
-            warn_of_clock_step(run, result.errors.clock_step)
+        if clock_step is not None and given.clocks == "given":
+            warn_of_clock_step(run, clock_step)
         if knock is not None and rest is not None:
             ((again, result),) = _track(rest, silhouettes, [given], parts, report)
             run = replace(again, knocks=(knock, *again.knocks))

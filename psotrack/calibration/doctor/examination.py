@@ -174,19 +174,20 @@ def _find_change(rig: Rig, seen: ExaminedFrames) -> Knock | ClockStep | None:
     """A camera that changes in mid-flight, by where pairs of cameras, or more, put the bodies in all frames."""
     step = -(-seen.sightings.num_frames // MOST_FRAMES)
     every = replace(seen, frames=np.arange(0, seen.sightings.num_frames, step))
-    sightings, rate_hz = seen.sightings[every.frames], seen.fps / step
+    sightings = seen.sightings[every.frames]
     frame, box, places_m = every.matched(rig, least=2)
     number = frame // step
     position_m = by_image(number, places_m, len(every.frames))
     seen_px = sightings.centre_px[number[:, None], np.arange(len(rig)), box]
     used_px = by_image(number, np.where(box[..., None] >= 0, seen_px, np.nan), len(every.frames))
-    velocity_m_s = _velocities(position_m, rate_hz)
+    velocity_m_s = _velocities(position_m, seen.fps / step)
     all_px = with_nearest_sightings(rig.cameras, used_px, sightings, position_m, np.zeros_like(position_m))
     used, shown = (
         views_of_places(rig.cameras, places_px, np.ones(places_px.shape), position_m, velocity_m_s)
         for places_px in (used_px, all_px)
     )
-    change = find_change(used, shown, rate_hz)
+    # One frame is lost, however many of them are looked at.
+    change = find_change(used, shown, seen.fps)
     return None if change is None else replace(change, frame=change.frame * step)
 
 

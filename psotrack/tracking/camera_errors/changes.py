@@ -70,13 +70,15 @@ class ClockStep:
 
 
 class _Step(NamedTuple):
+    """A step of a camera: `change` are pixels or seconds, `clear` how many times as large it is as usual differences.
+
+    `explains` is the squared distance of the levels before and after by what is told of them, per dimension.
+    """
+
     frame: int
     camera: int
-    #: (dims,), pixels or seconds.
-    change: np.ndarray
-    #: How many times as large the change is as differences between neighbouring windows usually are.
+    change: Float[np.ndarray, "dims"]
     clear: float
-    #: Squared distance of the levels before and after by what is told of them, per dimension.
     explains: float
 
 
@@ -89,7 +91,7 @@ def find_change(views: CameraViews, all_views: CameraViews, rate_hz: float) -> K
     Args:
         views: the views that say where the other cameras put the bodies.
         all_views: all that the cameras show of these bodies.
-        rate_hz: frames per second.
+        rate_hz: frames per second of the cameras: a lost frame is one of these.
     """
     knock = _clearest_step(views, all_views, _LEAST_PX)
     late = _clearest_step(views, all_views, _LEAST_FRAMES / rate_hz, along_motion=True)
@@ -130,6 +132,7 @@ def _of_cameras(
     frame: Int[np.ndarray, "rows"],
     per_s: Float[np.ndarray, "rows cameras 2"] | None,
 ) -> list[_Told]:
+    """What is told of each camera, by all its places, and by those of the others that count."""
     told = []
     for camera in range(counts.shape[1]):
         shown = counts.copy()
