@@ -2,7 +2,8 @@
 
 FFmpeg, inside OpenCV, decodes. What a header says of the number of frames and of their rate is an estimate in many
 containers, so that the packets of a file, which hold one encoded frame each, are counted and their times are read.
-Where the first or the last of them is no frame that FFmpeg shows, all frames are decoded and counted.
+Where the first of them are not the frames that FFmpeg shows, all frames are decoded and counted. The last frame is not
+decoded for that: in many videos of H.264 all frames from the last key frame on, ten seconds of them, come before it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import math
 import os
 import shlex
 from bisect import bisect_left
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,7 +35,9 @@ _READ_IMAGES = 5
 _SEEK_BEFORE = 17
 #: Times nearer than this are one time: containers round to a millisecond.
 _SAME_S = 2e-3
-#: Time before the end from which on frames are decoded to find the last one, seconds.
+#: Number of first frames of which the times are compared with those of the packets.
+_FIRST_FRAMES = 3
+#: Time before the end in which frames that cannot be decoded show the picture before, seconds.
 _END_S = 1.0
 #: Number of packets in a row that cannot be decoded from which on a video is at its end: ten seconds at 30 Hz.
 _FAILURES = 300
@@ -89,8 +91,8 @@ class VideoInfo:
 def probe(path: Path | str) -> VideoInfo:
     """Count the frames of a video, and read their times.
 
-    Packets are read without decoding, which is as fast as reading the file; some frames at both ends are decoded. The
-    frames of a video that was not finished are counted without its last frame, because it may be incomplete.
+    Packets are read without decoding, which is as fast as reading the file; the first frames are decoded. The frames of
+    a video that was not finished are counted without its last frame, because it may be incomplete.
 
     Raises:
         InputError: the file does not exist, is empty, is not a video, has no frames, or none that can be decoded.
@@ -107,11 +109,13 @@ def probe(path: Path | str) -> VideoInfo:
         times_s = packet_times(path)
         if not times_s:
             raise InputError(path, expected="a video with frames", found="no frames")
-        ends_s = _end_times(capture, times_s[-1])
-    if not ends_s:
+        first_s = list(itertools.islice(_grabbed_times(capture), _FIRST_FRAMES))
+    if not first_s:
         raise _undecodable(path, len(times_s), codec)
     is_finished = stated >= 1
-    is_timed = np.allclose(ends_s, [times_s[0], times_s[-1]], rtol=0, atol=_SAME_S)
+    is_timed = len(first_s) <= len(times_s) and np.allclose(
+        first_s, times_s[: len(first_s)], rtol=0, atol=_SAME_S
+    )
     if not is_finished:
         times_s = times_s[:-1]
     elif not is_timed:
@@ -163,18 +167,6 @@ def _grabbed_times(capture: cv2.VideoCapture) -> Iterator[float]:
     """Times of the frames, or of the packets, from here to the end, seconds."""
     while _grab(capture):
         yield capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-
-
-def _end_times(capture: cv2.VideoCapture, last_s: float) -> list[float]:
-    """Times of the first and the last frame that can be decoded, seconds; empty if the first cannot be.
-
-    The last frame is reached by a seek; NaN is its time where the seek fails.
-    """
-    first_s = next(_grabbed_times(capture), None)
-    if first_s is None:
-        return []
-    capture.set(cv2.CAP_PROP_POS_MSEC, 1e3 * max(0.0, last_s - _END_S))
-    return [first_s, *deque(_grabbed_times(capture), maxlen=1)] if last_s > first_s else [first_s, first_s]
 
 
 def _decoded_times(path: Path, packets_s: list[float]) -> tuple[list[float], bool]:
@@ -264,7 +256,7 @@ def read_frames(
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
     The codec must decode the frames in between, but they are not converted to BGR. A frame that cannot be decoded
-    shows the picture before.
+    shows the picture before, also at the end of a file, if all but its last second can be decoded.
 
     Args:
         video: the video.
@@ -289,8 +281,11 @@ def read_frames(
         for index in range(video.num_frames):
             if reached < index:
                 if not _grab(capture):
-                    raise TruncatedVideoError(video, index)
-                reached = max(index, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
+                    if frame is None or not video.is_timed or video.num_frames - index > _END_S * video.fps:
+                        raise TruncatedVideoError(video, index)
+                    reached = video.num_frames
+                else:
+                    reached = max(index, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
             if index % step:
                 continue
             if reached == index or frame is None:
