@@ -29,6 +29,7 @@ from psotrack.foreground.silhouettes import (
     Living,
     Silhouettes,
     compute,
+    exposures_of,
     find_background,
     scaled_settings,
 )
@@ -72,7 +73,7 @@ from psotrack.tracking.camera_errors import views_of_places, with_camera_errors,
 from psotrack.tracking.fusion import fuse_tracks
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.matching import Sightings
-from psotrack.tracking.swarm import Places, RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.swarm import Places, RunInputs, compile_ahead, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status, Tracks
 
 logger = logging.getLogger(__name__)
@@ -120,15 +121,19 @@ def track_recording(
         settings = msgspec.structs.replace(settings, detections=str(folder))
     silhouettes = None
     if settings.needs_silhouettes or "method" in parts:
-        silhouettes = compute(
-            recording,
-            settings.silhouettes,
-            cache=Path(cache),
-            jobs=jobs,
-            background=parts.get("background"),
-            all_videos=settings.needs_each_video,
-            report=report,
-        )
+        with ThreadPoolExecutor(1) as beside:
+            # The processes that make silhouettes leave this one nothing to do.
+            if method is None and settings.method != "projection-lines":
+                beside.submit(_compile_ahead, recording, settings, parts)
+            silhouettes = compute(
+                recording,
+                settings.silhouettes,
+                cache=Path(cache),
+                jobs=jobs,
+                background=parts.get("background"),
+                all_videos=settings.needs_each_video,
+                report=report,
+            )
         if "background" not in parts:
             scaled = scaled_settings(settings.silhouettes, recording)
             model = find_background(settings.silhouettes.background, scaled)
@@ -177,6 +182,20 @@ def track_runs(
         raise SettingsError("silhouettes", expected="silhouettes of all cameras", found="none")
     tracked = _track(recording, silhouettes, settings, parts, report)
     return [finish(run, result) for run, result in tracked]
+
+
+def _compile_ahead(recording: Recording, settings: TrackSettings, parts: Parts) -> None:
+    """Compile the swarm's program for silhouettes that are being made."""
+    part = recording.at_rate(settings.rate_hz)
+    timeline = part.timeline()
+    compile_ahead(
+        part.rig,
+        tracker_settings(settings, search=parts.get("search"), score=parts.get("score")),
+        fps=part.fps,
+        reduction=scaled_settings(settings.silhouettes, recording).reduction,
+        exposures=None if timeline.is_synchronous else exposures_of(timeline),
+        num_frames=timeline.num_instants,
+    )
 
 
 def _track(

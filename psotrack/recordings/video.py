@@ -38,7 +38,7 @@ _SAME_S = 2e-3
 #: Number of first frames of which the times are compared with those of the packets.
 _FIRST_FRAMES = 3
 #: Time before the end in which frames that cannot be decoded show the picture before, seconds.
-_END_S = 1.0
+_END_S = 0.5
 #: Number of packets in a row that cannot be decoded from which on a video is at its end: ten seconds at 30 Hz.
 _FAILURES = 300
 #: Sound in containers comes in blocks, of 46 ms at most in AAC of 22 kHz, and often ends after the pictures.
@@ -256,7 +256,7 @@ def read_frames(
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
     The codec must decode the frames in between, but they are not converted to BGR. A frame that cannot be decoded
-    shows the picture before, also at the end of a file, if all but its last second can be decoded.
+    shows the picture before, also at the end of a file, if all but its last half second can be decoded.
 
     Args:
         video: the video.

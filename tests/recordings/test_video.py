@@ -167,7 +167,7 @@ def test_of_a_video_that_is_cut_short_the_rest_is_used(tmp_path, fraction, capfd
     assert 0 < video.num_frames < 40
     assert len(list(read_frames(video))) == video.num_frames
     assert f"its header says 40 frames until 1.60 s, and the {video.num_frames} that can be" in caplog.text
-    # More than what the last second may lack.
+    # More than what the last half second may lack.
     longer = replace(video, num_frames=80)
     refused = f"cam1i_s.avi: expected 80 frames, found that only {video.num_frames} can be decoded"
     for step in (1, 7):

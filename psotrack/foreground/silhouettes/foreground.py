@@ -33,6 +33,7 @@ _BACKGROUND_RATIO = 0.5
 
 #: An image with one or three channels.
 _Image = UInt8[np.ndarray, "..."]
+_Mask = UInt8[np.ndarray, "height width"]
 
 
 def learning_step(num_frames: int, settings: ForegroundSettings) -> int:
@@ -93,7 +94,7 @@ class Mog2:
     @property
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
-        return {"mog2": msgspec.to_builtins(self.settings)}
+        return {"version": 2, "mog2": msgspec.to_builtins(self.settings)}
 
     def foreground(
         self,
@@ -102,12 +103,25 @@ class Mog2:
     ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
         """See `BackgroundModel`: values between 0 and 255 are weighted shadow."""
         settings = self.settings
-        model = learned_mog2(((1.0, reduce_frame(frame, settings)) for frame in learning), settings)
-        levels = _levels(settings)
+        return self.masks(
+            ((1.0, reduce_frame(frame, settings)) for frame in learning),
+            (reduce_frame(frame, settings) for frame in frames),
+        )
+
+    def masks(
+        self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]
+    ) -> Iterator[_Mask | None]:
+        """Yield the foreground of each of `frames`, as `foreground` does.
+
+        Args:
+            learning: weights and reduced frames from the whole video.
+            frames: all frames in their order, reduced.
+        """
+        settings = self.settings
+        model, levels = learned_mog2(learning, settings), _levels(settings)
         least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
         light = light_of(model.getBackgroundImage())
-        for frame in frames:
-            image = reduce_frame(frame, settings)
+        for image in frames:
             if math.isinf(compare(image, light).log_gain):
                 yield None
                 continue

@@ -25,7 +25,13 @@ from zarr.storage import MemoryStore
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes.first_look import look_first
-from psotrack.foreground.silhouettes.foreground import BackgroundModel, coverage, learning_step, reduce_frame
+from psotrack.foreground.silhouettes.foreground import (
+    BackgroundModel,
+    Mog2,
+    coverage,
+    learning_step,
+    reduce_frame,
+)
 from psotrack.foreground.silhouettes.living_background import Living
 from psotrack.foreground.silhouettes.repeated_frames import FrameChanges, repeated_frames
 from psotrack.foreground.silhouettes.settings import ForegroundSettings
@@ -109,7 +115,7 @@ class Task:
     def num_decoded(self) -> int:
         """Number of frames that are decoded: all, and those of a pass that learns the background."""
         num_frames = self.video.num_frames
-        if isinstance(self.background, Living):
+        if isinstance(self.background, Living | Mog2):
             return num_frames
         return num_frames + len(range(0, num_frames, learning_step(num_frames, self.settings)))
 
@@ -265,10 +271,10 @@ def foreground_of(
         SettingsError: the background model yields masks of a wrong number, type or shape.
     """
     video, settings, background = task.video, task.settings, task.background
-    # "living" keeps only reduced frames. A model that the user brings may keep what it is given.
-    into_one = isinstance(background, Living) and settings.working_reduction > 1
+    # The package's models keep only reduced frames. One that the user brings may keep what it is given.
+    into_one = isinstance(background, Living | Mog2) and settings.working_reduction > 1
     frames = _decoded(read_frames(video, into_one=into_one), seconds, advance, changes)
-    if isinstance(background, Living) and settings.first_look:
+    if isinstance(background, Mog2) or (isinstance(background, Living) and settings.first_look):
         masks = background.masks(*look_first(video, frames, settings))
     elif isinstance(background, Living):
         masks = background.masks_as_they_come(reduce_frame(frame, settings) for frame in frames)

@@ -69,11 +69,11 @@ class MotionParams:
 def motion_params(settings: MotionSettings, num_drones: int) -> MotionParams:
     """Parameters of the motion model for `num_drones` drones, as float32 arrays."""
     return MotionParams(
-        jerk_density_m2_s5=jnp.full(num_drones, settings.jerk_density, jnp.float32),
-        velocity_std_m_s=jnp.float32(settings.velocity_std_m_s),
-        acceleration_std_m_s2=jnp.float32(settings.acceleration_std_m_s2),
-        error_share=jnp.float32(settings.error_share),
-        error_time_s=jnp.float32(settings.error_time_s),
+        jerk_density_m2_s5=np.full(num_drones, settings.jerk_density, np.float32),
+        velocity_std_m_s=np.asarray(settings.velocity_std_m_s, np.float32),
+        acceleration_std_m_s2=np.asarray(settings.acceleration_std_m_s2, np.float32),
+        error_share=np.asarray(settings.error_share, np.float32),
+        error_time_s=np.asarray(settings.error_time_s, np.float32),
     )
 
 

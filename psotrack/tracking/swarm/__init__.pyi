@@ -10,7 +10,7 @@ from .fitness import (
     foreground_and_area,
 )
 from .parameters import TrackerSettings, find_score, find_search, tracker_settings
-from .recording import Places, track_silhouettes
+from .recording import Places, compile_ahead, track_silhouettes
 from .run import RunInputs
 from .search import ParticleSwarm, Search, SearchRegion, particle_swarm
 from .stepwise import StepwiseTracker
@@ -32,6 +32,7 @@ __all__ = [
     "TrackerSettings",
     "camera_scores",
     "camera_weights",
+    "compile_ahead",
     "find_score",
     "find_search",
     "foreground_and_area",

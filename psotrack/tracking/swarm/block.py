@@ -17,15 +17,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from psotrack.foreground.silhouettes import Exposures
 from psotrack.geometry import Camera, Rig
 from psotrack.support import as_written, processors
+from psotrack.support.array_types import Key
 from psotrack.tracking.births import FrameBlobs
 from psotrack.tracking.swarm import tracker
 from psotrack.tracking.swarm.patches import make_pyramid
 from psotrack.tracking.swarm.tracker import Frames, Program, Rows, Slots, TrackerParams, TrackStarts
+from psotrack.trajectories import Status
 
 #: Number of frames of a block of a recording. Eight cameras of 1080p at a quarter of the size take 40 MB on the device.
 BLOCK_FRAMES = 25
@@ -35,7 +37,10 @@ CAPACITIES = (2, 4, 8, 12, 16, 24, 32, 48, 64)
 
 def on_device(cameras: Camera) -> Camera:
     """The cameras in float32, in which the tracker computes."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float32), cameras)
+    # Not `jnp.asarray`: it compiles a program for each new shape, here and elsewhere.
+    return jax.device_put(
+        jax.tree.map(lambda leaf: np.asarray(leaf, bool if leaf.dtype == bool else np.float32), cameras)
+    )
 
 
 @dataclass(frozen=True)
@@ -134,6 +139,11 @@ class Job:
     params: TrackerParams
     program: Program
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no drone is followed and none begins, so that there is nothing to compute."""
+        return not (np.asarray(self.slots.present).any() or (np.asarray(self.starts.frame) >= 0).any())
+
 
 class Engine:
     """Computes blocks of runs on the default device.
@@ -152,10 +162,13 @@ class Engine:
     def track(self, jobs: Sequence[Job], block: Block) -> list[tuple[Slots, Rows]]:
         """The drones after the block, and the rows of its frames in NumPy, for each job."""
         groups: dict[Any, list[int]] = {}
+        done: dict[int, tuple[Slots, Rows]] = {}
         for number, job in enumerate(jobs):
+            if job.is_empty:
+                done[number] = _without_drones(job, block)
+                continue
             shape = job.program, len(job.slots), jax.tree.structure(job.params)
             groups.setdefault(shape, []).append(number)
-        done: dict[int, tuple[Slots, Rows]] = {}
         for numbers in groups.values():
             found = self._run([jobs[number] for number in numbers], block)
             done |= dict(zip(numbers, found, strict=True))
@@ -163,6 +176,10 @@ class Engine:
             (slots, jax.tree.map(lambda leaf: np.asarray(leaf)[: len(block)], rows))
             for slots, rows in (done[number] for number in range(len(jobs)))
         ]
+
+    def compile(self, job: Job, block: Block) -> None:
+        """Compile the program for a job, also of slots without drones."""
+        self._run([job], block)
 
     def _run(self, jobs: Sequence[Job], block: Block) -> list[tuple[Slots, Rows]]:
         if self.side_by_side:
@@ -195,6 +212,35 @@ class Engine:
 _one_run = jax.jit(tracker.track, static_argnames="program")
 
 
+def _without_drones(job: Job, block: Block) -> tuple[Slots, Rows]:
+    """What the tracker gives for slots without drones: the first block of a recording compiles nothing for it."""
+    num_frames, num_cameras = len(block.frames.elapsed), block.coverage.shape[1]
+
+    def unknown(*shape: int) -> Float[np.ndarray, "..."]:
+        return np.full((num_frames, len(job.slots), *shape), np.nan, np.float32)
+
+    none = np.zeros((num_frames, len(job.slots)), np.int32)
+    rows = Rows(
+        position_m=unknown(3),
+        velocity_m_s=unknown(3),
+        covariance_m2=unknown(3, 3),
+        measured_m=unknown(3),
+        measured_covariance_m2=unknown(3, 3),
+        fitness=unknown(),
+        num_cameras=none,
+        status=none + np.int32(Status.LOST),
+        box_px=unknown(num_cameras, 4),
+        middle_px=unknown(num_cameras, 2),
+    )
+    return replace(job.slots, key=_key_after(job.slots.key, num_frames)), rows
+
+
+@partial(jax.jit, static_argnames="num_frames")
+def _key_after(key: Key, num_frames: int) -> Key:
+    """The tracker's random key after some frames."""
+    return jax.lax.fori_loop(0, num_frames, lambda _, key: tracker.next_keys(key)[0], key)
+
+
 @partial(jax.jit, static_argnames=("structure", "program"))
 def _side_by_side(
     leaves: list[Any], frames: Frames, cameras: Camera, structure: Any, program: Program
@@ -223,6 +269,9 @@ def grown(slots: Slots, more: Slots) -> Slots:
     key = slots.key
 
     def joined(first: Any, last: Any) -> Any:
-        return jnp.concatenate([first, last[before:]]) if first.ndim and first.dtype != key.dtype else first
+        # In NumPy, because each operation of JAX would be a program of its own.
+        if not first.ndim or first.dtype == key.dtype:
+            return first
+        return jax.device_put(np.concatenate([np.asarray(first), np.asarray(last)[before:]]))
 
     return replace(jax.tree.map(joined, slots, more), key=key)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
+import numpy as np
 
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
 from psotrack.support import as_written, make_plugin
@@ -127,15 +127,15 @@ def tracker_params(settings: TrackerSettings, num_slots: int, limits: FlightLimi
     """
     of_run = settings.of_run
     return tracker.TrackerParams(
-        num_iterations=jnp.int32(of_run.swarm.iterations),
-        bounds_m=jnp.asarray(limits.bounds_m, jnp.float32),
-        dt_s=jnp.float32(1 / limits.fps),
-        max_speed_m_s=jnp.float32(limits.max_speed_m_s),
-        spread_m=jnp.float32(of_run.swarm.spread_m),
+        num_iterations=np.asarray(of_run.swarm.iterations, np.int32),
+        bounds_m=np.asarray(limits.bounds_m, np.float32),
+        dt_s=np.asarray(1 / limits.fps, np.float32),
+        max_speed_m_s=np.asarray(limits.max_speed_m_s, np.float32),
+        spread_m=np.asarray(of_run.swarm.spread_m, np.float32),
         search=settings.search,
         motion=motion_params(of_run.motion, num_slots),
-        min_fitness=jnp.float32(of_run.status.min_fitness),
-        min_cameras=jnp.int32(of_run.status.min_cameras),
-        max_coasting_frames=jnp.int32(round(of_run.status.max_coasting_s * limits.fps)),
-        learns_sizes=jnp.bool_(of_run.drones.learn_sizes and of_run.drones.size_m is None),
+        min_fitness=np.asarray(of_run.status.min_fitness, np.float32),
+        min_cameras=np.asarray(of_run.status.min_cameras, np.int32),
+        max_coasting_frames=np.asarray(round(of_run.status.max_coasting_s * limits.fps), np.int32),
+        learns_sizes=np.asarray(of_run.drones.learn_sizes and of_run.drones.size_m is None, np.bool_),
     )

@@ -13,17 +13,20 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.foreground.silhouettes import Silhouettes
+from psotrack.foreground.silhouettes import Exposures, Silhouettes, border_cells
 from psotrack.geometry import Rig
 from psotrack.support import Report, as_written, no_progress
 from psotrack.tracking.births import TrackCandidate, state_at
 from psotrack.tracking.swarm.block import BLOCK_FRAMES, Block, Engine, Setting, make_block
+from psotrack.tracking.swarm.parameters import TrackerSettings
 from psotrack.tracking.swarm.run import RunInputs, Start, SwarmRun
 from psotrack.tracking.swarm.tracker import Rows, Slots
 from psotrack.trajectories import ARRAYS, Arrival, Tracks, padded
 
 #: Largest number of searches for new drones in a block: each time with the drones that the search before has found.
 _MOST_SEARCHES = 3
+#: Number of drones for which the program is compiled ahead where the number is not given.
+USUAL_DRONES = 4
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,39 @@ def track_silhouettes(
             last = block
             advance(len(block))
     return [_results(each) for each in progress]
+
+
+@as_written()
+def compile_ahead(
+    rig: Rig,
+    settings: TrackerSettings,
+    *,
+    fps: float,
+    reduction: int,
+    exposures: Exposures | None,
+    num_frames: int,
+) -> None:
+    """Compile the program that `track_silhouettes` will need, while its silhouettes are made.
+
+    The number of drones that is given is taken, or `USUAL_DRONES`: another number compiles once more, later.
+
+    Args:
+        rig: calibrated cameras.
+        settings: settings of the run.
+        fps: instants per second.
+        reduction: image pixels per silhouette pixel, along each side.
+        exposures: when the frames will be exposed; None where all cameras' frames are exposed together.
+        num_frames: number of instants.
+    """
+    borders = border_cells(rig.cameras.image_size_wh, reduction)
+    setting, length = Setting(rig, reduction, borders, fps), min(BLOCK_FRAMES, num_frames)
+    engine = Engine(setting)
+    run = SwarmRun(setting, RunInputs(np.zeros((2, 3)), settings), on_cpu=not engine.side_by_side)
+    run.resize(settings.of_run.drones.count or USUAL_DRONES)
+    coverage = np.zeros((length, len(rig), *borders.max(axis=0)[::-1]), np.uint8)
+    exposed = None if exposures is None else exposures[:length]
+    block = make_block(setting, np.arange(length), coverage, exposed, length=length)
+    engine.compile(run.job(block, []), block)
 
 
 def _planned(

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -356,7 +355,7 @@ class SwarmRun:
         """Track nothing in some slots any more."""
         present = np.array(self.slots.present)
         present[gone] = False
-        self.slots = replace(self.slots, present=jnp.asarray(present))
+        self.slots = replace(self.slots, present=jax.device_put(present))
 
     def _nothing_may_begin(self, block: Block, rows: Rows) -> bool:
         """Whether all drones that may be are known, and none is lost that could come back."""

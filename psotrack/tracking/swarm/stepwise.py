@@ -82,7 +82,7 @@ class StepwiseTracker:
         while drones < self._most:
             self._run.resize(drones + 1)
             drones = len(self._run.drone)
-            self._engine.track([self._run.job(block, [])], block)
+            self._engine.compile(self._run.job(block, []), block)
         self._run.resize(0)
 
     @as_written()

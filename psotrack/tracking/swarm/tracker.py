@@ -224,6 +224,11 @@ def empty_slots(key: Key, count: int, params: TrackerParams) -> Slots:
     )
 
 
+def next_keys(key: Key) -> Key:
+    """(3,), keys of the next frame, of the particles and of the search. The key is consumed."""
+    return jax.random.split(key, 3)
+
+
 def step(
     slots: Slots, frame: Frames, cameras: Camera, params: TrackerParams, program: Program
 ) -> tuple[Slots, Rows]:
@@ -236,7 +241,7 @@ def step(
         params: parameters, which may change without a new compilation.
         program: static values, which are compiled in.
     """
-    key_next, key_spread, key_search = jax.random.split(slots.key, 3)
+    key_next, key_spread, key_search = next_keys(slots.key)
     elapsed_s, exposures = frame.elapsed.astype(jnp.float32) * params.dt_s, frame.exposures
     region = _reachable(slots, elapsed_s, params)
     was_lost = slots.missed > params.max_coasting_frames
