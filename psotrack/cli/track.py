@@ -87,6 +87,8 @@ def track(
         causal: track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.
         most_drones: largest number of drones at one time with --causal.
     """
+    # While this process imports what it needs, which takes a second, another one gets ready to make silhouettes.
+    support.start_server("psotrack.foreground.silhouettes.store")
     from psotrack import pipeline
 
     out = out or beside(sequence, "tracks.csv")

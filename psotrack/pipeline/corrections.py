@@ -7,7 +7,6 @@ from __future__ import annotations
 import logging
 import shlex
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -143,13 +142,5 @@ def without_knocked(run: Run, knock: Knock) -> Recording | None:
         return None
     shown = timeline.frame[: knock.frame, knock.camera]
     count = int(shown.max(initial=-1)) + 1
-
-    def until_knock(times: Any) -> Any:
-        listed_s = None if times.listed_s is None else times.listed_s[:count]
-        return replace(times, num_frames=count, listed_s=listed_s)
-
-    cameras = tuple(
-        replace(each, times=until_knock(each.times)) if each.name == name else each
-        for each in recording.cameras
-    )
+    cameras = tuple(each.first(count) if each.name == name else each for each in recording.cameras)
     return replace(recording, cameras=cameras, timing=Timing(recording.fps, recording.num_frames))

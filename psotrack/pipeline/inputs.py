@@ -265,6 +265,7 @@ class Run:
         sightings: detections of all cameras at the instants; None where the method reads none.
         detection_keys: digests of the files or silhouettes that the detections come from, by camera.
         read_s: time in which the detections were read, seconds.
+        volume_s: time in which the volume was found, seconds.
         clocks: clocks of the cameras, where they were estimated and corrected; None elsewhere.
         knocks: knocks of cameras that the recording is without from then on.
     """
@@ -280,6 +281,7 @@ class Run:
     sightings: Sightings | None
     detection_keys: Mapping[str, str]
     read_s: float
+    volume_s: float
     clocks: CameraClocks | None = None
     knocks: tuple[Knock, ...] = ()
 
@@ -326,7 +328,21 @@ def prepare(
     volume = flight_volume(recording.rig, points.get(key), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)
-    return Run(recording, given, silhouettes, settings, parts, start, volume, plugin, sightings, keys, read_s)
+    volume_s = time.perf_counter() - began - read_s
+    return Run(
+        recording,
+        given,
+        silhouettes,
+        settings,
+        parts,
+        start,
+        volume,
+        plugin,
+        sightings,
+        keys,
+        read_s,
+        volume_s,
+    )
 
 
 def _without_folds(recording: Recording, sightings: Sightings) -> tuple[Recording, Sightings]:

@@ -157,11 +157,12 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         trajectories = replace(trajectories, covariance_m2=wider_m2)
     timeline = recording.timeline()
     trajectories = replace(trajectories, position_m=body_m, time_s=timeline.time_s)
-    seconds = dict.fromkeys(("decode", "foreground", "compile", "finish"), 0.0)
+    seconds = dict.fromkeys(("decode", "foreground", "silhouettes", "compile", "finish"), 0.0)
     seconds |= {} if silhouettes is None else silhouettes.seconds
+    seconds["volume"] = run.volume_s
     seconds |= result.seconds
     seconds["finish"] += time.perf_counter() - began
-    seconds["total"] = sum(seconds[stage] for stage in ("track", "compile", "finish"))
+    seconds["total"] = sum(seconds[stage] for stage in ("volume", "track", "compile", "finish"))
     record = {
         "sequence": recording.name,
         "frames": trajectories.num_frames,

@@ -51,7 +51,7 @@ from .plugins import (
     plugin_source,
     register_plugin,
 )
-from .processes import map_in_processes
+from .processes import map_in_processes, start_server
 from .progress import (
     Advance,
     Report,
@@ -179,6 +179,7 @@ __all__ = [
     "short_text",
     "similarity",
     "standard_error",
+    "start_server",
     "terminal_bar",
     "text_table",
     "time_blocks",

@@ -47,10 +47,10 @@ def map_in_processes(
 ) -> list[_Result]:
     """Compute `[function(task, advance) for task in tasks]` in up to `jobs` processes.
 
-    The workers are new Python interpreters with one OpenCV thread each. They end with this call, also if Ctrl-C or
-    SIGKILL ends it: the pipe to the worker breaks, the next `advance` in the worker raises `BrokenPipeError`, and the
-    clean-up of `function` runs; it also runs in workers that Ctrl-C finds in a long step. With one job or one task the
-    work is done in the calling process.
+    The workers have one OpenCV thread each, and nothing of this process's memory. They end with this call, also if
+    Ctrl-C or SIGKILL ends it: the pipe to the worker breaks, the next `advance` in the worker raises `BrokenPipeError`,
+    and the clean-up of `function` runs; it also runs in workers that Ctrl-C finds in a long step. With one job or one
+    task the work is done in the calling process.
 
     Args:
         function: importable by name; calls `advance` at least a few times per second.
@@ -67,8 +67,8 @@ def map_in_processes(
     """
     if jobs == 1 or len(tasks) < 2:
         return [function(task, advance) for task in tasks]
-    # Spawned, not forked: a forked copy of a process with JAX or OpenCV threads may hang.
-    context = multiprocessing.get_context("spawn")
+    start_server(function.__module__)
+    context = _context()
     connections: list[Connection] = []
     processes = []
     waiting = deque(enumerate(tasks))
@@ -107,6 +107,27 @@ def map_in_processes(
         for process in processes:
             process.join()
     return [results[index] for index in range(len(tasks))]
+
+
+def start_server(module: str) -> None:
+    """Start the process from which workers will be forked, with a module imported, without waiting for it.
+
+    A program that calls this first has workers at once where it needs them. Nothing happens if the process is there, or
+    where the system cannot fork.
+    """
+    context = _context()
+    if context.get_start_method() == "forkserver":
+        from multiprocessing import forkserver
+
+        context.set_forkserver_preload([module] if module != "__main__" else [])
+        with _start_of_workers():
+            forkserver.ensure_running()
+
+
+def _context() -> Any:
+    # Not forked from this process: a forked copy of a process with JAX or OpenCV threads may hang.
+    methods = multiprocessing.get_all_start_methods()
+    return multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
 
 
 @contextlib.contextmanager

@@ -91,7 +91,8 @@ def read(path):
 
 def assert_record_of_contract(record, num_drones):
     assert set(record) >= RECORD
-    assert set(record["seconds"]) == {"decode", "foreground", "track", "compile", "finish", "total"}
+    stages = {"decode", "foreground", "silhouettes", "volume", "track", "compile", "finish", "total"}
+    assert set(record["seconds"]) == stages
     assert [drone["drone"] for drone in record["drones"]] == [*range(num_drones)]
     for drone in record["drones"]:
         assert set(drone) == {"drone", "size_m", "size_std_m", "size_frames", "fill"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -309,15 +310,17 @@ def _size_wh(rig: Rig, name: str) -> tuple[int, int]:
 
 
 def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
-    """Make and store silhouettes; returns the seconds of each stage, summed over the workers."""
+    """Make and store silhouettes; returns the seconds of "decode" and "foreground", summed over the workers, and those
+    of the whole."""
     # Two cameras with the same content have the same key, so their silhouettes are made once.
     missing = list({task.stored.path: task for task in tasks}.values())
-    taken: list[dict[str, float]] = []
+    taken, began = list[dict[str, float]](), time.perf_counter()
     if missing:
         logger.info("silhouettes: computing those of %d videos", len(missing))
         with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
             taken = map_in_processes(store, missing, jobs=jobs, advance=advance)
-    return {stage: sum((each[stage] for each in taken), 0.0) for stage in ("decode", "foreground")}
+    seconds = {stage: sum((each[stage] for each in taken), 0.0) for stage in ("decode", "foreground")}
+    return {**seconds, "silhouettes": time.perf_counter() - began}
 
 
 def _left_out(name: str, array: zarr.Array, times: FrameTimes, *, with_future: bool) -> list[Interval]:

@@ -27,7 +27,8 @@ class Silhouettes:
             border count as background.
         num_frames: number of frames of the longest camera.
         shape: height and width of the largest silhouette, cells.
-        seconds: time spent on "decode" and "foreground", summed over workers; 0 for silhouettes from the store.
+        seconds: time spent on "decode" and "foreground", summed over workers, and time until all "silhouettes" were
+            made; 0 for silhouettes from the store.
         arrays: one array (frames, height, width) per camera, stored or in memory; cameras may differ in frames, height
             and width. A camera without silhouettes has no frames.
         exposures: when the frames were exposed; None where frame i of every camera is instant i.

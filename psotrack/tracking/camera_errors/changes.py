@@ -108,28 +108,27 @@ def _clearest_step(
     for counts, part in zip(views.parts(), all_views.parts(), strict=True):
         num_frames, num_drones = part.position_m.shape[:2]
         frame = np.repeat(np.arange(first, first + num_frames), num_drones)
+        body = np.tile(np.arange(num_drones), num_frames)
         per_s = part.flow_px_s.reshape(-1, part.num_cameras, 2) if along_motion else None
-        told.append(_of_cameras(part.places, counts.places.shown, frame, per_s))
+        told.append(_of_cameras(part.places, counts.places.shown, np.stack([frame, body], axis=1), per_s))
         first += num_frames
     found: list[_Step] = []
     for camera, of_parts in enumerate(zip(*told, strict=True)):
-        frames, equations, shown = (np.concatenate(each) for each in zip(*of_parts, strict=True))
-        found += _steps(camera, frames, equations, shown, least)
+        row, equations, shown = (np.concatenate(each) for each in zip(*of_parts, strict=True))
+        found += _steps(camera, row, equations, shown, least)
     # Two cameras differ by as much: rather, one has lost frames than the other has repeated some.
     return max(found, key=lambda step: (round(step.clear, 3), step.change[0]), default=None)
 
 
-#: Frames in which a camera shows something, what they tell of a change of its places, as equations [left | right], and
-#: the number of bodies that each camera shows in them.
-_Told = tuple[
-    Int[np.ndarray, "frames"], Float[np.ndarray, "frames dims _"], Float[np.ndarray, "frames cameras"]
-]
+#: Frame and body of each place that a camera shows, what it tells of a change of its places, as equations
+#: [left | right], and whether each camera shows the body.
+_Told = tuple[Int[np.ndarray, "rows 2"], Float[np.ndarray, "rows dims _"], Bool[np.ndarray, "rows cameras"]]
 
 
 def _of_cameras(
     places: FittedPlaces,
     counts: Bool[np.ndarray, "rows cameras"],
-    frame: Int[np.ndarray, "rows"],
+    row: Int[np.ndarray, "rows 2"],
     per_s: Float[np.ndarray, "rows cameras 2"] | None,
 ) -> list[_Told]:
     """What is told of each camera, by all its places, and by those of the others that count."""
@@ -140,12 +139,12 @@ def _of_cameras(
         one = replace(places, shown=shown)
         rows = np.flatnonzero(shown[:, camera] & one.determined)
         motion = None if per_s is None else per_s[rows, camera]
-        told.append(_against_others(one.only(rows), frame[rows], camera, motion))
+        told.append(_against_others(one.only(rows), row[rows], camera, motion))
     return told
 
 
 def _against_others(
-    used: FittedPlaces, frame: Int[np.ndarray, "rows"], camera: int, per_s: Float[np.ndarray, "rows 2"] | None
+    used: FittedPlaces, row: Int[np.ndarray, "rows 2"], camera: int, per_s: Float[np.ndarray, "rows 2"] | None
 ) -> _Told:
     """What is told of one camera, by rows in which it shows something.
 
@@ -162,24 +161,22 @@ def _against_others(
     if per_s is not None:
         along = per_s[:, None]
         left, rest_px = along @ left @ along.swapaxes(-1, -2), along @ rest_px
-    frames, number = np.unique(frame, return_inverse=True)
-    equations = np.zeros((len(frames), left.shape[1], left.shape[1] + 1))
-    np.add.at(equations, number, np.concatenate([left, rest_px], axis=-1))
-    shown = np.zeros((len(frames), used.shown.shape[1]))
-    np.add.at(shown, number, weight)
-    return frames, equations, shown
+    return row, np.concatenate([left, rest_px], axis=-1), used.shown
 
 
 def _steps(
     camera: int,
-    frames: Int[np.ndarray, "frames"],
-    equations: Float[np.ndarray, "frames dims _"],
-    shown: Float[np.ndarray, "frames cameras"],
+    row: Int[np.ndarray, "rows 2"],
+    of_rows: Float[np.ndarray, "rows dims _"],
+    shown: Bool[np.ndarray, "rows cameras"],
     least: float,
 ) -> Iterator[_Step]:
     """The clearest step of a camera, by each length of the windows, if it is one."""
+    frames, number = np.unique(row[:, 0], return_inverse=True)
+    equations = np.zeros((len(frames), *of_rows.shape[1:]))
+    np.add.at(equations, number, of_rows)
     total = np.concatenate([np.zeros((1, *equations.shape[1:])), np.cumsum(equations, axis=0)])
-    _, sets = np.unique(shown > 0, axis=0, return_inverse=True)
+    _, sets = np.unique(np.column_stack([row[:, 1], shown]), axis=0, return_inverse=True)
     for window in _WINDOWS:
         if len(frames) < 6 * window:
             break
@@ -192,7 +189,7 @@ def _steps(
         shortest = total[at] - total[at - _WINDOWS[0] // 2], total[at + _WINDOWS[0] // 2] - total[at]
         length2 = float(change[best] @ change[best])
         sudden = float(_change(*shortest)[0] @ change[best])
-        part = _part_that_stays(change[best], equations, sets, int(at))
+        part = _part_that_stays(change[best], of_rows, sets, int((number < at).sum()))
         wide = total[at] - total[at - 2 * window], total[at + 2 * window] - total[at]
         longer = float(_change(*wide)[0] @ change[best])
         clearly = float(np.sqrt(clear[best])) / max(float(usual), np.finfo(float).tiny)
@@ -212,13 +209,13 @@ def _steps(
 
 def _part_that_stays(
     change: Float[np.ndarray, "dims"],
-    equations: Float[np.ndarray, "frames dims _"],
-    sets: Int[np.ndarray, "frames"],
+    equations: Float[np.ndarray, "rows dims _"],
+    sets: Int[np.ndarray, "rows"],
     at: int,
 ) -> float:
-    """Part of a change that all frames before and after a step show, each set of cameras by what it tells of it.
+    """Part of a change that all rows before and after a step show, by what each body in a set of cameras tells of it.
 
-    Other cameras show the body elsewhere by the errors of the rig.
+    Other cameras show the body elsewhere by the errors of the rig, and another body is elsewhere.
     """
     part = whole = 0.0
     for one in np.intersect1d(sets[:at], sets[at:]).tolist():
