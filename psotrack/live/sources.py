@@ -139,20 +139,20 @@ class ReplayedVideo:
     loops: int = 1
 
     def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
-        """See `LiveSource`: a frame arrives when its time has come."""
+        """See `LiveSource`: a frame arrives, decoded, when its time has come."""
         length_s = float(self.time_s[-1] - self.time_s[0]) * (1 + 1 / max(1, len(self.time_s) - 1))
         images = itertools.chain.from_iterable(read_frames(self.video) for _ in range(self.loops))
-        # As if the camera had filmed before: to open a video takes as long as several frames.
-        images = itertools.chain([next(images)], images)
-        began_s = begin()
+        image, began_s = next(images, None), begin()
         for loop, frame_s in itertools.product(range(self.loops), self.time_s.tolist()):
             time_s = frame_s + loop * length_s
             arrives_s = began_s + time_s / self.speed
+            assert image is not None, "a video has as many frames as times"
             while (left_s := arrives_s - time.monotonic()) > 0 and not stopped():
                 time.sleep(min(left_s, 0.1))
             if stopped():
                 return
-            yield SourceFrame(time_s, next(images), arrives_s)
+            yield SourceFrame(time_s, image, arrives_s)
+            image = next(images, None)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -262,7 +263,8 @@ def _videos(folder: Path, files: Sequence[Path], names: Sequence[str]) -> dict[s
     for path in candidates:
         if path not in found.values():
             _logger.info("%s: not used, because no camera in %s has this name", path, CALIBRATION)
-    return {name: probe(path) for name, path in found.items()}
+    with ThreadPoolExecutor() as threads:  # each video is opened and decodes its first frames
+        return dict(zip(found, threads.map(probe, found.values()), strict=True))
 
 
 def _frame_times(videos: Mapping[str, VideoInfo], detections: Mapping[str, Path]) -> dict[str, FrameTimes]:

@@ -149,11 +149,12 @@ def compile_ahead(
     borders = border_cells(rig.cameras.image_size_wh, reduction)
     setting, length = Setting(rig, reduction, borders, fps), min(BLOCK_FRAMES, num_frames)
     engine = Engine(setting)
-    run = SwarmRun(setting, RunInputs(np.zeros((2, 3)), settings), on_cpu=not engine.side_by_side)
-    run.resize(settings.of_run.drones.count or USUAL_DRONES)
     coverage = np.zeros((length, len(rig), *borders.max(axis=0)[::-1]), np.uint8)
     exposed = None if exposures is None else exposures[:length]
     block = make_block(setting, np.arange(length), coverage, exposed, length=length)
+    run = SwarmRun(setting, RunInputs(np.zeros((2, 3)), settings), on_cpu=not engine.side_by_side)
+    engine.track([run.job(block, [])], block)  # the first block, before a drone is found
+    run.resize(settings.of_run.drones.count or USUAL_DRONES)
     engine.compile(run.job(block, []), block)
 
 
