@@ -102,11 +102,7 @@ class Run:
         }
 
     def save(
-        self,
-        folder: Path,
-        *,
-        rows: pd.DataFrame | None = None,
-        figures: Mapping[str, Any] | None = None,
+        self, folder: Path, *, rows: pd.DataFrame | None = None, figures: Mapping[str, Any] | None = None
     ) -> None:
         """Write rows to `folder`/NAME.csv, and the record to `folder`/NAME.json.
 
@@ -118,11 +114,7 @@ class Run:
         folder.mkdir(parents=True, exist_ok=True)
         if rows is not None:
             rows.to_csv(folder / f"{self.name}.csv", index=False, float_format="%.6g")
-        record = self.facts | {
-            "machine": machine(),
-            "versions": versions(),
-            "figures": dict(figures or {}),
-        }
+        record = self.facts | {"machine": machine(), "versions": versions(), "figures": dict(figures or {})}
         path = folder / f"{self.name}.json"
         temporary = path.with_suffix(".json.part")
         temporary.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")

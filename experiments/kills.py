@@ -102,10 +102,7 @@ COMMANDS = {
         "onboard localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force",
         ("poses.csv",),
     ),
-    "export": Command(
-        f"export {{given}}/tracks.csv {FLIGHT} --to mot --out {{out}}/mot --force",
-        ("mot",),
-    ),
+    "export": Command(f"export {{given}}/tracks.csv {FLIGHT} --to mot --out {{out}}/mot --force", ("mot",)),
     "pack": Command(
         f"archive {{given}}/tracks.csv {FLIGHT} --out {{out}}/flight.psotrack --force --cache {{given}}/cache",
         ("flight.psotrack",),

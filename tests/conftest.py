@@ -45,11 +45,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The same examples in every run, so that a failure can be repeated. No deadline, because the first example of a
 # compiled function includes the compilation.
 settings.register_profile(
-    "psotrack",
-    derandomize=True,
-    deadline=None,
-    max_examples=40,
-    suppress_health_check=[HealthCheck.too_slow],
+    "psotrack", derandomize=True, deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("psotrack")
 

@@ -73,11 +73,7 @@ def labelled(rig: Rig, case: str, seed: int, num_frames: int) -> dict[str, Any]:
     stated = turned(rig, turn_deg, rng)
     settings = TrackSettings()
     tracks, places = track_detections(
-        stated.cameras,
-        sightings,
-        settings,
-        fps=FPS,
-        bounds_m=np.array([[-4.0, -4.0, 0.0], [4.0, 4.0, 4.0]]),
+        stated.cameras, sightings, settings, fps=FPS, bounds_m=np.array([[-4.0, -4.0, 0.0], [4.0, 4.0, 4.0]])
     )
     found = (tracks.status == Status.TRACKED)[..., None]
     position_m = np.where(found, tracks.position_m, np.nan)

@@ -186,14 +186,7 @@ def make_recording(folder: Path, views: dict[str, View], time_s: np.ndarray, pla
     pd.concat(pairs).to_csv(folder / "pairs.csv", index=False)
     write_rig(folder / "lenses.toml", make_rig(lenses), force=True)
     (folder / "recording.toml").write_text("\n".join(lines) + "\n")
-    words = (
-        "--pairs",
-        str(folder / "pairs.csv"),
-        "--lenses",
-        str(folder / "lenses.toml"),
-        "--noise",
-        "10",
-    )
+    words = ("--pairs", str(folder / "pairs.csv"), "--lenses", str(folder / "lenses.toml"), "--noise", "10")
     refused = psotrack("calibrate", "rig", *words, "--out", str(folder / "rig.toml"), "--force")
     assert not refused, refused
 

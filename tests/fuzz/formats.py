@@ -385,14 +385,7 @@ _OTHERS = {
 }
 
 #: The formats by name.
-FORMATS: dict[str, Format] = {
-    **_CALIBRATIONS,
-    **_TRACKS,
-    **_RECORDINGS,
-    **_PICTURES,
-    **_TABLES,
-    **_OTHERS,
-}
+FORMATS: dict[str, Format] = {**_CALIBRATIONS, **_TRACKS, **_RECORDINGS, **_PICTURES, **_TABLES, **_OTHERS}
 
 
 def make_all(folder: Path, names: Iterable[str]) -> None:

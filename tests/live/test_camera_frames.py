@@ -16,13 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_sweeps import wait_until
 
-from psotrack.live import (
-    CameraRecorder,
-    Instant,
-    Meeting,
-    StreamClock,
-    recording_folder,
-)
+from psotrack.live import CameraRecorder, Instant, Meeting, StreamClock, recording_folder
 from psotrack.recordings import FrameTimes, Recording, VideoEncoder, make_timeline, probe, read_frames
 from psotrack.recordings.datasets import open_recording
 

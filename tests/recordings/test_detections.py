@@ -15,14 +15,7 @@ from hypothesis import strategies as st
 import psotrack as pt
 from psotrack.geometry import project
 from psotrack.geometry.rig_files import write_rig
-from psotrack.recordings import (
-    Detections,
-    VideoWriter,
-    probe,
-    read_detections,
-    read_frames,
-    write_detections,
-)
+from psotrack.recordings import Detections, VideoWriter, probe, read_detections, read_frames, write_detections
 from psotrack.recordings.datasets import open_recording
 from psotrack.trajectories import read_trajectories
 

@@ -30,13 +30,7 @@ from placed_drones import (
 )
 
 from psotrack.geometry import project
-from psotrack.simulation import (
-    RESTLESS,
-    CameraRenderer,
-    SimulationSettings,
-    change_scenario,
-    simulate,
-)
+from psotrack.simulation import RESTLESS, CameraRenderer, SimulationSettings, change_scenario, simulate
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.scenery import Scenery

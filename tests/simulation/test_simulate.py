@@ -20,11 +20,7 @@ from psotrack import __version__
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.geometry.rig_files import read_rig
 from psotrack.recordings import probe, read_detections, read_frames
-from psotrack.recordings.datasets import (
-    MARKER_CORNERS,
-    read_marker_corners,
-    read_sequence,
-)
+from psotrack.recordings.datasets import MARKER_CORNERS, read_marker_corners, read_sequence
 from psotrack.simulation import (
     OWN_CAMERAS,
     CameraRenderer,

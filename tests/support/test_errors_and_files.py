@@ -18,13 +18,7 @@ from psotrack.errors import (
     SettingsError,
     errors_name,
 )
-from psotrack.support import (
-    atomic_write,
-    atomic_write_all,
-    digest_file,
-    digest_record,
-    refuse_to_overwrite,
-)
+from psotrack.support import atomic_write, atomic_write_all, digest_file, digest_record, refuse_to_overwrite
 
 # --- messages
 

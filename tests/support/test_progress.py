@@ -47,10 +47,7 @@ def test_the_rest_is_not_as_slow_as_a_step_that_waited_for_a_compilation() -> No
     ]
 
 
-@given(
-    seconds=st.lists(st.floats(0, 50), min_size=1, max_size=60),
-    long_s=st.sampled_from([0.0, 20.0]),
-)
+@given(seconds=st.lists(st.floats(0, 50), min_size=1, max_size=60), long_s=st.sampled_from([0.0, 20.0]))
 def test_few_lines_and_none_about_short_stages(seconds: list[float], long_s: float) -> None:
     lines = lines_of([(each, 1) for each in seconds], len(seconds), long_s)
     if sum(seconds) < long_s:

@@ -135,11 +135,7 @@ def test_text():
 
 
 @settings(max_examples=12)
-@given(
-    outer=st.integers(1, 3),
-    inner=st.integers(1, 12),
-    magnitude=st.sampled_from([1e-4, 1.0, 1e3]),
-)
+@given(outer=st.integers(1, 3), inner=st.integers(1, 12), magnitude=st.sampled_from([1e-4, 1.0, 1e3]))
 def test_text_is_at_most_80_characters_wide_and_complete(outer, inner, magnitude):
     """For any number of columns, no line is wider than 80, and every figure is printed once per row."""
     table = itertools.product(["S0", "S1"], range(outer), range(inner), [99, 101])
