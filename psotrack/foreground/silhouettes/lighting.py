@@ -65,18 +65,19 @@ class Light:
 
     Attributes:
         background: (height, width, 3), the background, grey levels.
-        rows, columns: rows and columns of the pixels that are compared, the same number in each part.
         parts: number of parts along y and x.
+        chosen: (rows, columns), the pixels that are compared, as many in each part: indices into the flat image.
         log_level: (rows, columns), logarithm of the background's grey levels there, mean of the channels.
         level: (rows, columns), the grey levels themselves, mean of the channels.
+        is_flat: whether the background shows nothing.
     """
 
     background: UInt8[np.ndarray, "height width 3"]
-    rows: Int[np.ndarray, "rows"]
-    columns: Int[np.ndarray, "columns"]
     parts: tuple[int, int]
+    chosen: Int[np.ndarray, "rows columns"]
     log_level: Float[np.ndarray, "rows columns"]
     level: Float[np.ndarray, "rows columns"]
+    is_flat: bool
 
 
 class Comparison(NamedTuple):
@@ -95,19 +96,16 @@ class Comparison(NamedTuple):
 
 def light_of(background: Real[np.ndarray, "height width 3"]) -> Light:
     """The light of a background, grey levels: (height, width, 3)."""
-    height, width = background.shape[:2]
-    parts = _parts(height, max(height, width)), _parts(width, max(height, width))
-    rows, columns = _spread(height, parts[0]), _spread(width, parts[1])
-    levels = background[np.ix_(rows, columns)].astype(np.float32)
-    log_level = np.log(levels + _DARK).mean(axis=-1)
-    return Light(
-        np.asarray(cv2.convertScaleAbs(background)), rows, columns, parts, log_level, levels.mean(axis=-1)
-    )
+    parts, chosen = _places(*background.shape[:2])
+    levels = background.reshape(-1, 3).take(chosen, axis=0).astype(np.float32)
+    log_level, level = _mean(np.log(levels + _DARK)), _mean(levels)
+    whole_levels = np.asarray(cv2.convertScaleAbs(background))
+    return Light(whole_levels, parts, chosen, log_level, level, _is_flat(level))
 
 
 def compare(image: UInt8[np.ndarray, "height width 3"], light: Light) -> Comparison:
     """Compare a frame with a background, at the pixels that `light` names."""
-    return _compare(_levels_at(image, light.rows, light.columns), light.level)
+    return _compare(_levels_at(image, light.chosen), light.level, light.is_flat)
 
 
 def show_one_scene(
@@ -119,28 +117,27 @@ def show_one_scene(
         images: images of one size.
         weights: how much each image counts.
     """
-    height, width = images[0].shape[:2]
-    places = [_spread(side, _parts(side, max(height, width))) for side in (height, width)]
-    levels = np.array([_levels_at(image, *places) for image in images])
+    _, chosen = _places(*images[0].shape[:2])
+    levels = np.array([_levels_at(image, chosen) for image in images])
     shown = np.array([not _is_flat(level) for level in levels])
     shown |= not shown.any()
     most = _weighted_median(levels[shown], np.asarray(weights)[shown])
-    shown &= [_compare(level, most).log_gain == 0 for level in levels]
+    shown &= [_compare(level, most, _is_flat(most)).log_gain == 0 for level in levels]
     return np.asarray(shown | (not shown.any()))
 
 
 def _compare(
-    level: Float[np.ndarray, "rows columns"], background: Float[np.ndarray, "rows columns"]
+    level: Float[np.ndarray, "rows columns"], background: Float[np.ndarray, "rows columns"], was_flat: bool
 ) -> Comparison:
     # A pixel that is saturated only now says nothing.
     says = (level < _SATURATED) | (background >= _SATURATED)
-    if says.mean() < _LEAST_CONTRAST:
+    if np.count_nonzero(says) < _LEAST_CONTRAST * says.size:
         return Comparison(math.inf)
     shown, known = level[says], background[says]
     bright = np.maximum(shown, known) >= LEAST_DIFFERENCE
-    if bright.mean() < _LEAST_SHARE:  # a dark scene, of which the light cannot be told
+    if np.count_nonzero(bright) < _LEAST_SHARE * bright.size:  # dark: the light cannot be told
         return Comparison(0.0)
-    change = float(np.median(np.log((shown[bright] + _DARK) / (known[bright] + _DARK))))
+    change = math.log(np.median((shown[bright] + _DARK) / (known[bright] + _DARK)))
     gain = 1.0
     if abs(change) > _LARGE_CHANGE:
         lit = known > 0
@@ -148,7 +145,6 @@ def _compare(
         gain = float(_weighted_median(shown[lit] / known[lit], known[lit])) if lit.any() else math.inf
         if gain < _LEAST_GAIN:
             return Comparison(math.inf)
-    was_flat = _is_flat(background)
     if gain > 1 / _LEAST_GAIN or (was_flat and _has_parts(level)):
         return Comparison(math.inf, math.inf if _is_flat(level) else 0)
     if not was_flat and not _has_contrast(shown / gain, known):
@@ -159,7 +155,11 @@ def _compare(
 def _weighted_median(
     values: Float[np.ndarray, "values *samples"], weights: Float[np.ndarray, "values"]
 ) -> Float[np.ndarray, "*samples"]:
-    return np.asarray(np.quantile(values, 0.5, axis=0, weights=weights, method="inverted_cdf"))
+    """Weighted median along the first axis: many times faster than `np.quantile`."""
+    order = values.argsort(axis=0)
+    shares = weights[order].cumsum(axis=0)
+    middle = (shares < shares[-1] / 2).sum(axis=0, keepdims=True)
+    return np.asarray(np.take_along_axis(values, np.take_along_axis(order, middle, axis=0), axis=0)[0])
 
 
 def _is_flat(level: Float[np.ndarray, "rows columns"]) -> bool:
@@ -191,14 +191,22 @@ def _has_contrast(level: Float[np.ndarray, "samples"], background: Float[np.ndar
 
 
 def _levels_at(
-    image: UInt8[np.ndarray, "height width 3"],
-    rows: Int[np.ndarray, "rows"],
-    columns: Int[np.ndarray, "columns"],
+    image: UInt8[np.ndarray, "height width 3"], chosen: Int[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "rows columns"]:
     """Grey levels of some pixels, mean of the channels."""
-    of_channels = image[np.ix_(rows, columns)].astype(np.float32)
-    # A sum of three arrays takes a fraction of the time of a mean along a short axis.
-    return (of_channels[..., 0] + of_channels[..., 1] + of_channels[..., 2]) / 3
+    return _mean(image.reshape(-1, 3).take(chosen, axis=0).astype(np.float32))
+
+
+def _mean(channels: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns"]:
+    """Mean of the channels: a sum of three arrays takes a fraction of the time of a mean along a short axis."""
+    return (channels[..., 0] + channels[..., 1] + channels[..., 2]) / 3
+
+
+def _medians(values: Float[np.ndarray, "parts samples"]) -> Float[np.ndarray, "parts"]:
+    """Median of each part without NaN, NaN where nothing else is: several times faster than `np.nanmedian`."""
+    ordered = np.sort(values, axis=-1)  # NaN come last
+    count, part = np.isfinite(ordered).sum(axis=-1), np.arange(len(values))
+    return (ordered[part, np.maximum(count - 1, 0) // 2] + ordered[part, count // 2]) / 2
 
 
 def remove_light(
@@ -229,7 +237,7 @@ def remove_light(
         return _multiplied(image, log_gain)
     # The light of a lamp may end anywhere between two parts, and each pixel is on one side or the other.
     brightest, darkest = _multiplied(image, least), _multiplied(image, most)
-    return np.clip(light.background, darkest, brightest)
+    return np.asarray(cv2.min(cv2.max(light.background, darkest), brightest))
 
 
 def _multiplied(
@@ -248,23 +256,21 @@ def _log_gains(
 ) -> tuple[Float[np.ndarray, "rows columns"], float]:
     """Logarithms of the gain of each part of the image, and of the whole image."""
     rows, columns = light.parts
-    chosen = np.ix_(light.rows, light.columns)
-    of_channels = _LOG_LEVELS[image[chosen]]
-    log_ratio = (of_channels[..., 0] + of_channels[..., 1] + of_channels[..., 2]) / 3 - light.log_level
-    log_ratio[(foreground[chosen] > 0) | (np.abs(log_ratio) > _LARGEST_LOG_GAIN)] = np.nan
+    log_ratio = _mean(_LOG_LEVELS.take(image.reshape(-1, 3).take(light.chosen, axis=0))) - light.log_level
+    log_ratio[(foreground.take(light.chosen) > 0) | (np.abs(log_ratio) > _LARGEST_LOG_GAIN)] = np.nan
     known = log_ratio[np.isfinite(log_ratio)]
     everywhere = float(np.median(known)) if known.size else 0.0
-    parts = log_ratio.reshape(rows, -1, columns, log_ratio.shape[1] // columns).swapaxes(1, 2)
-    values = np.ma.masked_invalid(parts.reshape(rows, columns, -1))
-    enough = values.count(axis=-1) >= max(1, _LEAST_SHARE * values.shape[-1])
-    medians = np.ma.median(values, axis=-1).filled(everywhere)
-    log_gain = np.where(enough, medians, everywhere).astype(np.float32)
+    values = log_ratio.reshape(rows, _SAMPLES, columns, _SAMPLES).swapaxes(1, 2).reshape(-1, _SAMPLES**2)
+    enough = np.isfinite(values).sum(axis=-1) >= _LEAST_SHARE * _SAMPLES**2
+    log_gain = np.where(enough, _medians(values), everywhere).astype(np.float32).reshape(light.parts)
     # One part alone is more often an object than a lamp.
     return np.asarray(cv2.medianBlur(log_gain, 3)) if min(log_gain.shape) >= 3 else log_gain, everywhere
 
 
-def _parts(side: int, longest: int) -> int:
-    return max(1, min(side, round(_PARTS * side / longest)))
+def _places(height: int, width: int) -> tuple[tuple[int, int], Int[np.ndarray, "rows columns"]]:
+    """Number of parts along y and x, and the pixels that are compared: see `Light`."""
+    down, right = (max(1, min(n, round(_PARTS * n / max(height, width)))) for n in (height, width))
+    return (down, right), _spread(height, down)[:, None] * width + _spread(width, right)
 
 
 def _spread(side: int, parts: int) -> Int[np.ndarray, "samples"]:
