@@ -38,13 +38,23 @@ from psotrack.foreground.silhouettes.lighting import (
     light_of,
     remove_light,
 )
-from psotrack.foreground.silhouettes.object_blobs import ObjectBlobs, find_objects, gradient, largest
+from psotrack.foreground.silhouettes.object_blobs import (
+    ObjectBlobs,
+    find_objects,
+    gradient,
+    largest,
+    possible_objects,
+)
 from psotrack.foreground.silhouettes.settings import ForegroundSettings
 
 #: MOG2's label of foreground that is no shadow.
 _FOREGROUND = 255
 #: Squared Mahalanobis distance from the background beyond which a pixel may be foreground.
 _VAR_THRESHOLD = 12.0
+#: MOG2's variance of a new colour, and its least variance, squared grey levels: OpenCV's own.
+_NEW_VARIANCE, _LEAST_VARIANCE = 15.0, 4.0
+#: Number of tiles along each side of an image.
+_TILES = 6
 #: Learning rate per frame. MOG2 takes a new colour for background at a weight of 0.1, which is after 6 frames.
 _LEARNING_RATE = 0.02
 #: Number of first frames of a file that are seen twice, 2 s of most videos.
@@ -156,9 +166,40 @@ class _Look(NamedTuple):
     image: _Image
     difference: _Mask
     differs: _Mask
+    asked: _Mask
     labels: _Mask
+    near: tuple[slice, slice]
     found: ObjectBlobs
     log_gain: float
+
+
+class _Mog2:
+    """OpenCV's MOG2, one for each tile of an image: a tile without a pixel that is asked about takes no time.
+
+    Args:
+        image: (height, width, 3), the background.
+        variance: variance of a new colour, squared grey levels.
+    """
+
+    def __init__(self, image: _Image, variance: float = _NEW_VARIANCE) -> None:
+        self.variance = max(_LEAST_VARIANCE, variance)
+        tiles = itertools.product(*map(_parts, image.shape[:2]))
+        self._tiles = [(tile, self._begun(image[tile])) for tile in tiles]
+
+    def _begun(self, image: _Image) -> cv2.BackgroundSubtractorMOG2:
+        model = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
+        model.setShadowThreshold(_SHADOW_BRIGHTNESS)
+        model.setVarInit(self.variance)
+        model.apply(image, learningRate=1)
+        return model
+
+    def labels(self, image: _Image, chosen: _Mask, learning_rate: float = 0.0) -> _Mask:
+        """(height, width), MOG2's labels of the chosen pixels, which it also learns; 0 elsewhere."""
+        labels, others = np.zeros_like(chosen), cv2.bitwise_not(chosen)
+        for tile, model in self._tiles:
+            if cv2.hasNonZero(chosen[tile]):
+                model.apply(image[tile], others[tile], labels[tile], learning_rate)
+        return np.asarray(cv2.bitwise_and(labels, chosen))
 
 
 class LivingBackground:
@@ -242,7 +283,7 @@ class _Scene:
         self._soft_edges = settings.soft_edges
         self._least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
         self._background: Float[np.ndarray, "height width 3"] = image.astype(np.float32)
-        self._begin_mog2()
+        self._mog2 = _Mog2(image)
         shape = image.shape[:2]
         self._square = np.zeros(shape, np.float32)
         self._change = np.zeros(shape, np.float32)
@@ -256,13 +297,6 @@ class _Scene:
         self._before: _Mask = np.full(shape, 255, np.uint8)
         self._expect()
 
-    def _begin_mog2(self, variance: float | None = None) -> None:
-        self._mog2 = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
-        self._mog2.setShadowThreshold(_SHADOW_BRIGHTNESS)
-        if variance is not None:
-            self._mog2.setVarInit(variance)
-        self._mog2.apply(np.asarray(cv2.convertScaleAbs(self._background)), learningRate=1)
-
     @property
     def num_known(self) -> int:
         return self._num_before + self._num_frames
@@ -273,8 +307,8 @@ class _Scene:
         scene._background = np.minimum(gain * self._background, 255)
         scene._square, scene._change = gain**2 * self._square, gain * self._change
         scene._last = cv2.convertScaleAbs(self._last, alpha=gain)
-        least, usual = self._mog2.getVarMin(), self._mog2.getVarInit()
-        scene._begin_mog2(max(least, usual * min(1.0, gain**2)))
+        background = np.asarray(cv2.convertScaleAbs(scene._background))
+        scene._mog2 = _Mog2(background, min(1.0, gain**2) * self._mog2.variance)
         scene._expected_until = 0
         scene._expect()
         return scene
@@ -288,30 +322,36 @@ class _Scene:
             # In the frame's own light, in which its noise is that of any frame.
             difference = cv2.convertScaleAbs(difference, alpha=math.exp(log_gain))
             usual, least = self._limits(math.exp(log_gain))
-        # MOG2 is asked only about pixels that differ, which takes a fraction of the time.
         differs = cv2.compare(difference, least, cv2.CMP_GT)
-        labels = cv2.bitwise_and(self._mog2.apply(image, cv2.bitwise_not(differs), None, 0), differs)
-        touching = cv2.dilate(_white(labels == _FOREGROUND), _TOUCHING)
-        changed = cv2.bitwise_and(touching, _white(labels > 0))
-        strong = cv2.bitwise_and(changed, cv2.compare(difference, usual, cv2.CMP_GT))
-        found = find_objects(changed, strong, difference, self._before, self._is_restless, self._least_px)
+        strong = cv2.compare(difference, usual, cv2.CMP_GT)
+        # MOG2 takes long: it is asked only about pixels that may belong to an object, and those that these may touch.
+        possible, near = possible_objects(differs, strong)
+        asked = cv2.bitwise_and(differs, cv2.dilate(possible, _TOUCHING))
+        labels = self._mog2.labels(image, asked)
+        touching = cv2.dilate(_white(labels[near] == _FOREGROUND), _TOUCHING)
+        changed = cv2.bitwise_and(touching, _white(labels[near] > 0))
+        strong = cv2.bitwise_and(changed, strong[near])
+        before, is_restless = self._before[near], self._is_restless[near]
+        found = find_objects(changed, strong, difference[near], before, is_restless, self._least_px)
+        self._foreground = _placed(found.mask, near, differs.shape)
         self._before = difference
-        self._last_look = _Look(image, difference, differs, labels, found, log_gain)
-        self._foreground = found.mask
-        return _with_soft_edges(found.mask, difference) if self._soft_edges else found.mask
+        self._last_look = _Look(image, difference, differs, asked, labels, near, found, log_gain)
+        soft = _with_soft_edges(found.mask, difference[near]) if self._soft_edges else found.mask
+        return _placed(soft, near, differs.shape)
 
     def learn(self, known: _Mask | None) -> None:
         at_first = self.num_known <= _ALL_LEARNED
         if at_first or self._num_frames - self._num_learned >= _LEARN_EVERY:
-            look = self._last_look
-            objects = look.found.with_own_edges(look.image, self.light.background)
+            look, near = self._last_look, self._last_look.near
+            own = look.found.with_own_edges(look.image[near], self.light.background[near])
+            objects = _placed(own, near, look.differs.shape)
             objects = objects if known is None else objects | known
             self._learn(look, objects)
             self._expect()
 
     def _learn(self, look: _Look, objects: _Mask) -> None:
         # A part of an object that one frame does not show is not learned at once.
-        protected = cv2.dilate(objects | self._objects, _MARGIN)
+        protected = cv2.dilate(cv2.bitwise_or(objects, self._objects), _MARGIN)
         self._objects = objects
         free = cv2.bitwise_not(protected)
         num_frames, self._num_learned = self._num_frames - self._num_learned, self._num_frames
@@ -319,17 +359,15 @@ class _Scene:
         learning_rate = max(_LEARNING_RATE, 1 / (self.num_known))
         # MOG2 takes long, and most pixels show the background as it is known: they are learned less often.
         self._num_updates += 1
-        known = (
-            protected
-            if self._num_updates % _ALL_EVERY == 0
-            else cv2.bitwise_or(protected, cv2.bitwise_not(look.differs))
-        )
-        self._mog2.apply(look.image, known, None, _of_frames(learning_rate, num_frames))
+        differs = cv2.bitwise_and(look.differs, free)
+        learned = free if self._num_updates % _ALL_EVERY == 0 else differs
+        labels = self._mog2.labels(look.image, learned, _of_frames(learning_rate, num_frames))
+        labels = cv2.copyTo(look.labels, look.asked, cv2.bitwise_and(labels, differs))
         cv2.accumulateWeighted(look.image, self._background, _of_frames(learning_rate, num_frames), free)
         if look.log_gain:
             return  # what a large change of the light leaves is not usual
         rate = max(_USUAL_RATE, 1 / (self._num_frames + _CALM_FRAMES))
-        unexplained = cv2.bitwise_and(look.difference, look.difference, mask=look.labels)
+        unexplained = cv2.bitwise_and(look.difference, look.difference, mask=labels)
         square = cv2.multiply(unexplained, unexplained, dtype=cv2.CV_32F)
         cv2.accumulateWeighted(square, self._square, _of_frames(rate, num_frames), free)
         num_frames = self._num_frames - self._num_changed
@@ -371,18 +409,9 @@ def _with_soft_edges(mask: _Mask, difference: _Mask) -> _Mask:
 
     A pixel that an object half covers differs from the background by half as much as its neighbours within the object.
     """
-    x, y, width, height = cv2.boundingRect(mask)
-    if not width:
-        return mask
-    # One pixel more on each side, where it is in the image.
-    top, left = max(y - 1, 0), max(x - 1, 0)
-    near = np.s_[top : y + height + 1, left : x + width + 1]
-    objects, differs = mask[near], difference[near]
-    within = cv2.dilate(cv2.bitwise_and(differs, objects), _AROUND)
-    share = cv2.divide(np.maximum(differs, _FAINT) - _FAINT, within, scale=255)
-    soft = np.zeros_like(mask)
-    soft[near] = cv2.bitwise_and(cv2.max(share, cv2.erode(objects, _AROUND)), cv2.dilate(objects, _AROUND))
-    return soft
+    within = cv2.dilate(cv2.bitwise_and(difference, mask), _AROUND)
+    share = cv2.divide(np.maximum(difference, _FAINT) - _FAINT, within, scale=255)
+    return np.asarray(cv2.bitwise_and(cv2.max(share, cv2.erode(mask, _AROUND)), cv2.dilate(mask, _AROUND)))
 
 
 def _of_frames(rate: float, num_frames: int) -> float:
@@ -393,6 +422,19 @@ def _of_frames(rate: float, num_frames: int) -> float:
 def _levels(limit: Float[np.ndarray, "height width"]) -> _Mask:
     """Limits in whole grey levels: a whole number is above one of these where it is above the limit."""
     return np.minimum(limit, 255).astype(np.uint8)
+
+
+def _placed(part: _Mask, near: tuple[slice, slice], shape: tuple[int, ...]) -> _Mask:
+    """(height, width), a part of a mask at its place, and 0 elsewhere."""
+    mask = np.zeros(shape, np.uint8)
+    mask[near] = part
+    return mask
+
+
+def _parts(side: int) -> list[slice]:
+    """The pixels along a side of an image, in as many parts as it has tiles."""
+    step = math.ceil(side / _TILES)
+    return [slice(start, start + step) for start in range(0, side, step)]
 
 
 def _white(chosen: np.ndarray) -> _Mask:

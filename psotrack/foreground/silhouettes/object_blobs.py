@@ -42,9 +42,9 @@ _SHARP_DIFFERENCE = 40.0
 #: Edges of an object at its contour, relative to the background's edges at the same place, and above them.
 _OWN_EDGES, _LEAST_EDGE = 1.3, 2.0
 _AROUND = np.ones((3, 3), np.uint8)
-#: Steps from a pixel to its eight neighbours, row by row.
-_DOWN = np.array([-1, -1, -1, 0, 0, 1, 1, 1])
-_RIGHT = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
+#: What is an object depends on so many pixels beside it: MOG2's foreground may touch it (2), and a gradient at its
+#: contour has pixels beyond (2).
+_MARGIN = 4
 
 _Mask = UInt8[np.ndarray, "height width"]
 
@@ -123,6 +123,24 @@ def find_objects(
     return ObjectBlobs(mask, found)
 
 
+def possible_objects(differs: _Mask, strong: _Mask) -> tuple[_Mask, tuple[slice, slice]]:
+    """The blobs of pixels that differ which have enough strong pixels, and the part of the image that they need.
+
+    Args:
+        differs: (height, width), above 0 at the pixels that differ from the background.
+        strong: (height, width), above 0 at those that differ by more than the place usually does.
+
+    Returns:
+        (height, width), 255 at the pixels of these blobs, else 0; rows and columns of them and what is beside them.
+    """
+    blobs = _connected(differs)
+    enough = blobs.sums(strong.ravel()[blobs.pixels] > 0) >= _STRONG_PIXELS
+    mask = _mask_of(blobs.chosen(enough).pixels, differs.shape)
+    x, y, width, height = cv2.boundingRect(mask)
+    rows, columns = (slice(max(0, at - _MARGIN), at + n + _MARGIN) for at, n in ((y, height), (x, width)))
+    return mask, (rows, columns)
+
+
 @dataclass(frozen=True)
 class _PixelBlobs:
     """Blobs, or their contours, as a list of pixels.
@@ -158,11 +176,8 @@ def _find_blobs(changed: _Mask, strong: _Mask, difference: _Mask, least_px: int,
     levels = difference.ravel()[wide.pixels]
     num_strong = wide.sums(strong_of_pixels)
     least = _ending_level(wide, np.where(strong_of_pixels, levels, 0), share)
-    kept = (
-        (num_strong >= _STRONG_PIXELS)[wide.blob]
-        & (wide.area >= least_px)[wide.blob]
-        & (levels > least[wide.blob])
-    )
+    enough = (num_strong >= _STRONG_PIXELS) & (wide.area >= least_px)
+    kept = enough[wide.blob] & (levels > least[wide.blob])
     return _connected(_mask_of(wide.pixels[kept], changed.shape))
 
 
@@ -180,15 +195,12 @@ def _ending_level(
 
 def _connected(mask: _Mask) -> _PixelBlobs:
     """The 8-connected blobs of a mask."""
-    x, y, width, height = cv2.boundingRect(mask)
-    count, labels = (
-        cv2.connectedComponents(mask[y : y + height, x : x + width], connectivity=8) if width else (1, mask)
-    )
-    inside = np.flatnonzero(labels > 0)  # several times faster than of the labels
+    _, top, _, height = cv2.boundingRect(mask)
+    rows = mask[top : top + height]
+    count, labels = cv2.connectedComponents(rows, connectivity=8) if height else (1, rows)
+    inside = np.flatnonzero(rows > 0)  # several times faster than of the labels
     blob = labels.ravel()[inside].astype(np.intp)
-    rows, columns = np.divmod(inside, max(width, 1))
-    pixels = (rows + y) * mask.shape[1] + columns + x
-    return _PixelBlobs(pixels, blob, np.bincount(blob, minlength=count))
+    return _PixelBlobs(inside + top * mask.shape[1], blob, np.bincount(blob, minlength=count))
 
 
 def _contours(blobs: _PixelBlobs, shape: tuple[int, ...]) -> _PixelBlobs:
@@ -196,37 +208,23 @@ def _contours(blobs: _PixelBlobs, shape: tuple[int, ...]) -> _PixelBlobs:
 
     A pixel outside belongs to the blob with the largest number beside the pixel.
     """
-    mask = _mask_of(blobs.pixels, shape)
-    contour = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, _AROUND)
-    points = np.flatnonzero(contour > 0)
-    labels = np.zeros(mask.size, np.intp)
-    labels[blobs.pixels] = blobs.blob
-    blob = labels[points]
-    outside = blob == 0
-    blob[outside] = labels[_neighbours(points[outside], shape)].max(axis=0, initial=0)
+    labels = np.zeros(shape, np.float32)
+    labels.ravel()[blobs.pixels] = blobs.blob
+    # Two blobs never touch, so that at a pixel inside, the largest number around is its own.
+    largest_around = cv2.dilate(labels, _AROUND)
+    points = np.flatnonzero((largest_around > 0) & (cv2.erode(labels, _AROUND) == 0))
+    blob = largest_around.ravel()[points].astype(np.intp)
     return _PixelBlobs(points, blob, np.bincount(blob, minlength=len(blobs.area)))
-
-
-def _neighbours(
-    points: Int[np.ndarray, "points"], shape: tuple[int, ...]
-) -> Int[np.ndarray, "neighbours points"]:
-    """The eight neighbours of pixels, row by row; those beyond the image's border are the pixels at the border."""
-    row, column = np.divmod(points, shape[1])
-    rows = np.clip(row + _DOWN[:, None], 0, shape[0] - 1)
-    columns = np.clip(column + _RIGHT[:, None], 0, shape[1] - 1)
-    return rows * shape[1] + columns
 
 
 def _gradient_at(
     image: UInt8[np.ndarray, "height width *channels"], points: Int[np.ndarray, "points"]
 ) -> Float[np.ndarray, "points"]:
-    """What `gradient` is at some pixels, given as flat indices."""
-    levels = image.reshape(-1, *image.shape[2:])[_neighbours(points, image.shape)].astype(np.float32)
-    north_west, north, north_east, west, east, south_west, south, south_east = levels
-    along_x = north_east - north_west + 2 * (east - west) + south_east - south_west
-    along_y = south_west - north_west + 2 * (south - north) + south_east - north_east
-    length = np.hypot(along_x, along_y)
-    return (length if length.ndim == 1 else length.max(axis=-1, initial=0)) / 4
+    """What `gradient` is at some pixels, given as flat indices; beyond the border, its pixels are repeated."""
+    along = [cv2.Sobel(image, cv2.CV_16S, dx, 1 - dx, borderType=cv2.BORDER_REPLICATE) for dx in (1, 0)]
+    along_x, along_y = (way.reshape(-1, *image.shape[2:]).take(points, axis=0) for way in along)
+    square = along_x.astype(np.float32) ** 2 + along_y.astype(np.float32) ** 2
+    return np.sqrt(square if square.ndim == 1 else largest(square[None])[0]) / 4
 
 
 def gradient(image: UInt8[np.ndarray, "height width *channels"]) -> Float[np.ndarray, "height width"]:
@@ -240,7 +238,7 @@ def gradient(image: UInt8[np.ndarray, "height width *channels"]) -> Float[np.nda
 
 def largest(image: Shaped[np.ndarray, "height width 3"]) -> Shaped[np.ndarray, "height width"]:
     """The largest of the three channels."""
-    blue, green, red = cv2.split(image)
+    blue, green, red = cv2.split(image, list(np.empty((3, *image.shape[:2]), image.dtype)))
     return np.asarray(cv2.max(cv2.max(blue, green), red))
 
 
