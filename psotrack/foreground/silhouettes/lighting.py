@@ -155,11 +155,7 @@ def _compare(
 def _weighted_median(
     values: Float[np.ndarray, "values *samples"], weights: Float[np.ndarray, "values"]
 ) -> Float[np.ndarray, "*samples"]:
-    """Weighted median along the first axis: many times faster than `np.quantile`."""
-    order = values.argsort(axis=0)
-    shares = weights[order].cumsum(axis=0)
-    middle = (shares < shares[-1] / 2).sum(axis=0, keepdims=True)
-    return np.asarray(np.take_along_axis(values, np.take_along_axis(order, middle, axis=0), axis=0)[0])
+    return np.asarray(np.quantile(values, 0.5, axis=0, weights=weights, method="inverted_cdf"))
 
 
 def _is_flat(level: Float[np.ndarray, "rows columns"]) -> bool:
@@ -200,13 +196,6 @@ def _levels_at(
 def _mean(channels: Float[np.ndarray, "rows columns 3"]) -> Float[np.ndarray, "rows columns"]:
     """Mean of the channels: a sum of three arrays takes a fraction of the time of a mean along a short axis."""
     return (channels[..., 0] + channels[..., 1] + channels[..., 2]) / 3
-
-
-def _medians(values: Float[np.ndarray, "parts samples"]) -> Float[np.ndarray, "parts"]:
-    """Median of each part without NaN, NaN where nothing else is: several times faster than `np.nanmedian`."""
-    ordered = np.sort(values, axis=-1)  # NaN come last
-    count, part = np.isfinite(ordered).sum(axis=-1), np.arange(len(values))
-    return (ordered[part, np.maximum(count - 1, 0) // 2] + ordered[part, count // 2]) / 2
 
 
 def remove_light(
@@ -255,14 +244,15 @@ def _log_gains(
     foreground: UInt8[np.ndarray, "height width"],
 ) -> tuple[Float[np.ndarray, "rows columns"], float]:
     """Logarithms of the gain of each part of the image, and of the whole image."""
-    rows, columns = light.parts
     log_ratio = _mean(_LOG_LEVELS.take(image.reshape(-1, 3).take(light.chosen, axis=0))) - light.log_level
     log_ratio[(foreground.take(light.chosen) > 0) | (np.abs(log_ratio) > _LARGEST_LOG_GAIN)] = np.nan
     known = log_ratio[np.isfinite(log_ratio)]
     everywhere = float(np.median(known)) if known.size else 0.0
-    values = log_ratio.reshape(rows, _SAMPLES, columns, _SAMPLES).swapaxes(1, 2).reshape(-1, _SAMPLES**2)
-    enough = np.isfinite(values).sum(axis=-1) >= _LEAST_SHARE * _SAMPLES**2
-    log_gain = np.where(enough, _medians(values), everywhere).astype(np.float32).reshape(light.parts)
+    values = log_ratio.reshape(light.parts[0], _SAMPLES, -1, _SAMPLES).swapaxes(1, 2).reshape(-1, _SAMPLES**2)
+    # NaN come last in order, which is many times faster than `np.nanmedian`.
+    ordered, count, part = np.sort(values, axis=-1), np.isfinite(values).sum(axis=-1), np.arange(len(values))
+    medians = (ordered[part, np.maximum(count - 1, 0) // 2] + ordered[part, count // 2]) / 2
+    log_gain = np.where(count >= _LEAST_SHARE * _SAMPLES**2, medians, everywhere).reshape(light.parts)
     # One part alone is more often an object than a lamp.
     return np.asarray(cv2.medianBlur(log_gain, 3)) if min(log_gain.shape) >= 3 else log_gain, everywhere
 

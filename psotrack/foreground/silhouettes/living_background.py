@@ -166,7 +166,6 @@ class _Look(NamedTuple):
     image: _Image
     difference: _Mask
     differs: _Mask
-    asked: _Mask
     labels: _Mask
     near: tuple[slice, slice]
     found: ObjectBlobs
@@ -315,6 +314,8 @@ class _Scene:
 
     def look(self, image: _Image, log_gain: float, num_frames: int) -> _Mask:
         self._num_frames += num_frames
+        num_new = self._num_frames - self._num_learned
+        self._is_learned = self.num_known <= _ALL_LEARNED or num_new >= _LEARN_EVERY
         image = remove_light(image, self.light, self._foreground, log_gain)
         difference = largest(cv2.absdiff(image, self.light.background))
         usual, least = self._usual, self._least
@@ -324,9 +325,10 @@ class _Scene:
             usual, least = self._limits(math.exp(log_gain))
         differs = cv2.compare(difference, least, cv2.CMP_GT)
         strong = cv2.compare(difference, usual, cv2.CMP_GT)
-        # MOG2 takes long: it is asked only about pixels that may belong to an object, and those that these may touch.
+        # MOG2 takes long: it is asked only about pixels that may belong to an object, and those that these may touch;
+        # in a frame that is learned, about all pixels that differ.
         possible, near = possible_objects(differs, strong)
-        asked = cv2.bitwise_and(differs, cv2.dilate(possible, _TOUCHING))
+        asked = differs if self._is_learned else cv2.bitwise_and(differs, cv2.dilate(possible, _TOUCHING))
         labels = self._mog2.labels(image, asked)
         touching = cv2.dilate(_white(labels[near] == _FOREGROUND), _TOUCHING)
         changed = cv2.bitwise_and(touching, _white(labels[near] > 0))
@@ -335,18 +337,16 @@ class _Scene:
         found = find_objects(changed, strong, difference[near], before, is_restless, self._least_px)
         self._foreground = _placed(found.mask, near, differs.shape)
         self._before = difference
-        self._last_look = _Look(image, difference, differs, asked, labels, near, found, log_gain)
+        self._last_look = _Look(image, difference, differs, labels, near, found, log_gain)
         soft = _with_soft_edges(found.mask, difference[near]) if self._soft_edges else found.mask
         return _placed(soft, near, differs.shape)
 
     def learn(self, known: _Mask | None) -> None:
-        at_first = self.num_known <= _ALL_LEARNED
-        if at_first or self._num_frames - self._num_learned >= _LEARN_EVERY:
+        if self._is_learned:
             look, near = self._last_look, self._last_look.near
             own = look.found.with_own_edges(look.image[near], self.light.background[near])
             objects = _placed(own, near, look.differs.shape)
-            objects = objects if known is None else objects | known
-            self._learn(look, objects)
+            self._learn(look, objects if known is None else objects | known)
             self._expect()
 
     def _learn(self, look: _Look, objects: _Mask) -> None:
@@ -359,15 +359,13 @@ class _Scene:
         learning_rate = max(_LEARNING_RATE, 1 / (self.num_known))
         # MOG2 takes long, and most pixels show the background as it is known: they are learned less often.
         self._num_updates += 1
-        differs = cv2.bitwise_and(look.differs, free)
-        learned = free if self._num_updates % _ALL_EVERY == 0 else differs
-        labels = self._mog2.labels(look.image, learned, _of_frames(learning_rate, num_frames))
-        labels = cv2.copyTo(look.labels, look.asked, cv2.bitwise_and(labels, differs))
+        learned = free if self._num_updates % _ALL_EVERY == 0 else cv2.bitwise_and(look.differs, free)
+        self._mog2.labels(look.image, learned, _of_frames(learning_rate, num_frames))
         cv2.accumulateWeighted(look.image, self._background, _of_frames(learning_rate, num_frames), free)
         if look.log_gain:
             return  # what a large change of the light leaves is not usual
         rate = max(_USUAL_RATE, 1 / (self._num_frames + _CALM_FRAMES))
-        unexplained = cv2.bitwise_and(look.difference, look.difference, mask=labels)
+        unexplained = cv2.bitwise_and(look.difference, look.difference, mask=look.labels)
         square = cv2.multiply(unexplained, unexplained, dtype=cv2.CV_32F)
         cv2.accumulateWeighted(square, self._square, _of_frames(rate, num_frames), free)
         num_frames = self._num_frames - self._num_changed
