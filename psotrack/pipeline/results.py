@@ -232,21 +232,21 @@ def _explained(run: Run, tracks: Tracks) -> dict[str, Any]:
     tracked = np.asarray(tracks.status == Status.TRACKED)
     frames = np.flatnonzero(tracked.any(axis=1))
     spread = np.linspace(0, len(frames) - 1, min(len(frames), _COUNTED_FRAMES)).round().astype(int)
-    seen, explained, in_view, found = np.zeros((4, len(rig)), int)
-    for frame in frames[spread].tolist():
-        one = slice(frame, frame + 1)
-        if run.sightings is not None:
-            sightings = run.sightings[one]
-        else:
-            assert run.silhouettes is not None, "a run has silhouettes or sightings"
-            sightings = from_silhouettes(run.silhouettes, first=frame, stop=frame + 1)
-        position_m = np.where(tracked[one, :, None], np.asarray(tracks.position_m[one], float), np.nan)
-        near = are_near(cameras, sightings, position_m, np.asarray(tracks.velocity_m_s[one], float))
-        seen += np.isfinite(sightings.noise_px).sum(axis=(0, 2))
-        explained += near.any(axis=1).sum(axis=(0, 2))
-        visible = in_images(cameras, position_m)
-        in_view += visible.sum(axis=(0, 1))
-        found += (visible & near.any(axis=-1)).sum(axis=(0, 1))
+    frames = frames[spread]
+    if run.sightings is not None:
+        sightings = run.sightings[frames]
+    else:
+        assert run.silhouettes is not None, "a run has silhouettes or sightings"
+        sightings = from_silhouettes(run.silhouettes, frames=frames)
+    position_m, velocity_m_s = (
+        np.asarray(values, float)[frames] for values in (tracks.position_m, tracks.velocity_m_s)
+    )
+    position_m = np.where(tracked[frames, :, None], position_m, np.nan)
+    near = are_near(cameras, sightings, position_m, velocity_m_s)
+    visible = in_images(cameras, position_m)
+    seen = np.isfinite(sightings.noise_px).sum(axis=(0, 2))
+    explained = near.any(axis=1).sum(axis=(0, 2))
+    in_view, found = visible.sum(axis=(0, 1)), (visible & near.any(axis=-1)).sum(axis=(0, 1))
     few = (explained < _FEW_EXPLAINED * seen) & (found < _FEW_EXPLAINED * in_view) & (seen >= _TOO_FEW)
     if few.any():
         logger.warning(

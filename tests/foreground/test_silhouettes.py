@@ -589,6 +589,21 @@ def test_blobs_by_hand():
     assert find_blobs(filled_up, 4, border).whole.tolist() == [True, False, True]
 
 
+def test_blobs_are_those_of_the_whole_silhouette():
+    """Only the part about the foreground is looked at; faint cells in the corners make it the whole silhouette."""
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        image = np.zeros((24, 30), np.uint8)
+        y, x = rng.integers(0, 20, 2)
+        part = image[y : y + 8, x : x + 8]
+        part[rng.random(part.shape) < 0.4] = 255
+        whole = image.copy()
+        whole[::23, ::29] = np.maximum(whole[::23, ::29], 1)
+        found, expected = find_blobs(image, 4), find_blobs(whole, 4)
+        for name, values in vars(found).items():
+            np.testing.assert_array_equal(values, getattr(expected, name))
+
+
 def test_all_blobs_of_a_silhouette_count_from_large_to_small():
     """An image has 70 blobs of increasing width. Regression: only the 50 largest counted, without a word."""
     image = np.zeros((70 * 5 + 4, 90), np.uint8)

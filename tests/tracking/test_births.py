@@ -32,7 +32,7 @@ from psotrack.tracking.births import (
     unexplained,
 )
 from psotrack.tracking.births.reidentification import NO_DRONE
-from psotrack.tracking.matching import NOISE_PX
+from psotrack.tracking.matching import NOISE_PX, from_silhouettes
 
 NUM_FRAMES = 25
 MAX_SPEED_M_S = 3.0
@@ -688,3 +688,15 @@ def test_a_drone_that_the_background_learns_only_seems_to_move():
     np.testing.assert_array_equal(gone.position_m[:, 0], [0.0, 0.27, 0.8, 0.0])
     np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [0.0, 0.3, 0.05, 0.0])
     np.testing.assert_array_equal(gone.left_m, [[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+
+
+def test_sightings_of_some_frames_of_silhouettes():
+    """60 frames with a square each; frames are read in pieces."""
+    coverage = np.zeros((60, 2, 30, 40), np.uint8)
+    for frame in range(60):
+        coverage[frame, :, 4 : 8 + frame // 10, 2 : 6 + frame // 2] = 255
+    silhouettes = silhouettes_in_memory(RIG.select(RIG.names[:2]), coverage, 2)
+    chosen = np.array([0, 3, 24, 25, 49, 59])
+    some, every = from_silhouettes(silhouettes, frames=chosen), from_silhouettes(silhouettes)[chosen]
+    np.testing.assert_array_equal(some.size_px, every.size_px)
+    assert some.size_px[:, 0, 0, 0].tolist() == [8, 10, 32, 32, 56, 66]

@@ -16,6 +16,8 @@ from psotrack.support.array_types import Array
 
 #: Neighbours of a cell that close a gap.
 _CLOSING = np.ones((3, 3), np.uint8)
+#: Cells beside the foreground on which the closing there depends.
+_BESIDE = 2
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,11 @@ def find_blobs(
         reduction: image pixels per cell, along each side.
         border: width and height of the image in cells, from `border_cells`; None where the array ends at its border.
     """
-    foreground = (coverage >= MIN_COVERAGE).view(np.uint8)
+    # Most of a silhouette is empty: only the part about the foreground is looked at, with cells for the closing.
+    x, y, width, height = cv2.boundingRect(coverage)
+    left, top = max(x - _BESIDE, 0), max(y - _BESIDE, 0)
+    part = coverage[top : y + height + _BESIDE, left : x + width + _BESIDE]
+    foreground = (part >= MIN_COVERAGE).view(np.uint8)
     # In thin silhouettes, gaps of one cell separate rotors and arms from the body.
     closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, _CLOSING)
     # Outlines instead of labels, because most of a silhouette is empty: labels would be written to every cell of it.
@@ -71,7 +77,7 @@ def find_blobs(
     corner, size = np.array(boxes[::-1], float).reshape(-1, 2, 2).swapaxes(0, 1)
     area = size.prod(axis=-1)
     order = np.argsort(-area, kind="stable")[: np.count_nonzero(area > 1)]
-    corner, size = corner[order], size[order]
+    corner, size = corner[order] + (left, top), size[order]
     end = coverage.shape[::-1] if border is None else border
     whole = ((corner > 0) & (corner + size < end)).all(axis=-1)
     return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)

@@ -85,12 +85,10 @@ def count_common(rig: Rig, found: Sightings | Silhouettes) -> tuple[int, int]:
     viewpoint, wide_m = viewpoints(rig.cameras), wide_bounds(rig)
     seen = met = 0
     spread = np.linspace(0, found.num_frames - 1, min(found.num_frames, _FRAMES))
-    for frame in np.unique(spread.round().astype(int)).tolist():
-        if isinstance(found, Sightings):
-            sightings = found[frame]
-        else:
-            sightings = from_silhouettes(found, first=frame, stop=frame + 1)[0]
-        view = sightings.largest(_MOST_SIGHTINGS)
+    frames = np.unique(spread.round().astype(int))
+    sightings = found[frames] if isinstance(found, Sightings) else from_silhouettes(found, frames=frames)
+    for number in range(len(frames)):
+        view = sightings[number].largest(_MOST_SIGHTINGS)
         if len(np.unique(viewpoint[np.isfinite(view.noise_px).any(axis=-1)])) < 2:
             continue
         seen += 1

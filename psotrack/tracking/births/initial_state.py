@@ -204,7 +204,7 @@ def first_drones(
         drones: number and sizes where they are known.
     """
     count = min(_FRAMES, silhouettes.num_frames)
-    sightings = from_silhouettes(silhouettes, stop=count)
+    sightings = from_silhouettes(silhouettes, frames=np.arange(count))
     limits = FlightLimits(fps, bounds_m, max_speed_m_s)
     rules = BirthRules(num_frames=silhouettes.num_frames, size_m=drones.size_m)
     births = Births(rig.cameras, limits, rules)
@@ -229,7 +229,7 @@ def _sizes_at(
 ) -> tuple[Float[np.ndarray, "drones 3"], Float[np.ndarray, "drones"]]:
     """Sizes of drones from their blobs in the first frames; and mean numbers of cameras."""
     count, num_drones = min(_START_FRAMES, silhouettes.num_frames), len(position_m)
-    seen, room_m = from_silhouettes(silhouettes, stop=count), wide_bounds(rig)
+    seen, room_m = from_silhouettes(silhouettes, frames=np.arange(count)), wide_bounds(rig)
     spans, numbers = np.full((count, num_drones, 2), np.nan), np.zeros((count, num_drones))
     std_m2 = np.tile(_GIVEN_STD_M**2 * np.eye(3), (num_drones, 1, 1))
     for frame in range(count):

@@ -222,16 +222,16 @@ def moving_points(
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
     starts = starts[np.unique(np.linspace(0, len(starts) - 1, min(count, len(starts))).round().astype(int))]
     points, limits = [], FlightLimits(fps / step, wide_bounds(rig), FASTEST_M_S)
-    for first in starts.tolist():
-        # The last window ends at the last of the frames.
-        stop = min(first + step * WINDOW_FRAMES, last + 1)
-        if isinstance(found, Sightings):
-            sightings = found[first:stop:step]
-        else:
-            sightings = from_silhouettes(found, first=first, stop=stop)[::step]
+    # The last window ends at the last of the frames. Windows of a short recording overlap.
+    windows = [
+        np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step) for first in starts.tolist()
+    ]
+    shown = np.unique(np.concatenate([np.empty(0, int), *windows]))
+    sightings = found[shown] if isinstance(found, Sightings) else from_silhouettes(found, frames=shown)
+    for window in windows:
         births = Births(rig.cameras, limits, rules)
-        for number in range(sightings.num_frames):
-            births.step(number, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
+        for instant, number in enumerate(np.searchsorted(shown, window).tolist()):
+            births.step(instant, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
         points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]
     table = np.array([point for point in points if point is not None]).reshape(-1, 5)
     apart_s = max(int(np.diff(starts).max(initial=0)) - step * WINDOW_FRAMES, 0) / 2 / fps

@@ -23,7 +23,7 @@ NOISE_PX, NOISE_SHARE = 1.0, 0.05
 CUT_SHARE = 0.25
 #: A box with an edge nearer to the image's border than this is taken as cut, pixels.
 BORDER_PX = 1.5
-#: Number of frames of silhouettes that are read together.
+#: Number of frames of silhouettes that are read together: as many as are stored together.
 _CHUNK_FRAMES = 25
 
 #: Images, middles, widths and heights of boxes, and whether each holds only a part.
@@ -169,28 +169,35 @@ def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: 
 
 
 def from_silhouettes(
-    silhouettes: Silhouettes, report: Report = no_progress, *, first: int = 0, stop: int | None = None
+    silhouettes: Silhouettes,
+    report: Report = no_progress,
+    *,
+    frames: Int[np.ndarray, "chosen"] | None = None,
 ) -> Sightings:
     """Make sightings from the blobs of foreground.
 
     Args:
         silhouettes: stored silhouettes of all cameras.
         report: receives the progress, in frames.
-        first, stop: first frame, and frame before which to stop; None: all. The sightings begin with frame `first`.
+        frames: (chosen,), numbers of the frames of which sightings are made, in ascending order; None: all.
     """
-    stop = silhouettes.num_frames if stop is None else stop
-    num_cameras, rows = len(silhouettes.cameras), list[_Rows]()
-    with report("blobs", stop - first) as advance:
-        for begin in range(first, stop, _CHUNK_FRAMES):
-            chunk = silhouettes.read(begin, min(begin + _CHUNK_FRAMES, stop))
-            for frame, views in enumerate(chunk, begin - first):
-                for camera, cells in enumerate(views):
-                    blobs = find_blobs(cells, silhouettes.reduction, silhouettes.borders[camera])
-                    image = np.full(len(blobs.whole), frame * num_cameras + camera)
+    frames = np.arange(silhouettes.num_frames) if frames is None else frames
+    num_cameras, borders, rows = len(silhouettes.cameras), silhouettes.borders, list[_Rows]()
+    with report("blobs", len(frames)) as advance:
+        for begin in range(0, silhouettes.num_frames, _CHUNK_FRAMES):
+            numbers = np.flatnonzero((frames >= begin) & (frames < begin + _CHUNK_FRAMES))
+            if not len(numbers):
+                continue
+            first, last = frames[numbers[[0, -1]]].tolist()
+            chunk = silhouettes.read(first, last + 1)
+            for number, frame in zip(numbers.tolist(), frames[numbers].tolist(), strict=True):
+                for camera, cells in enumerate(chunk[frame - first]):
+                    blobs = find_blobs(cells, silhouettes.reduction, borders[camera])
+                    image = np.full(len(blobs.whole), number * num_cameras + camera)
                     rows.append((image, blobs.centre_px, blobs.size_px, ~blobs.whole))
-            advance(len(chunk))
-    exposures = None if silhouettes.exposures is None else silhouettes.exposures[first:stop]
-    return from_boxes(*_joined(rows), stop - first, num_cameras, exposures)
+            advance(len(numbers))
+    exposures = None if silhouettes.exposures is None else silhouettes.exposures[frames]
+    return from_boxes(*_joined(rows), len(frames), num_cameras, exposures)
 
 
 def _joined(rows: list[_Rows]) -> _Rows:
