@@ -75,6 +75,9 @@ def fit_in_image(
         tried = _linearise(cameras, points_px, scale, fit.position_m + step_m)
         better = tried.cost < fit.cost
         damping = np.where(better, _LEAST_DAMPING, damping * _MORE_DAMPING)
+        if better.all():
+            fit = tried
+            continue
         fit = _Fit(
             *(
                 np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
@@ -82,7 +85,8 @@ def fit_in_image(
             )
         )
     information = fit.information
-    is_fixed = has_start & (np.linalg.cond(information) < 1 / np.finfo(float).eps)
+    lengths = np.linalg.svd(information, compute_uv=False)
+    is_fixed = has_start & (lengths[:, 0] * np.finfo(float).eps < lengths[:, -1])
     covariance_m2 = np.linalg.inv(np.where(is_fixed[:, None, None], information, np.eye(3)))
     return ImageFit(
         np.where(is_fixed[:, None], fit.position_m, np.nan),
@@ -164,21 +168,21 @@ def _differentiate(
     cameras: Camera, points_cam: Float[np.ndarray, "*#points 3"], R: Float[np.ndarray, "*#cameras 3 3"]
 ) -> tuple[Float[np.ndarray, "*#points 2"], Float[np.ndarray, "*#points 2 3"]]:
     """Pixels, and their derivatives by points whose coordinates R turns into those of the camera."""
-    z = np.maximum(points_cam[..., 2], NEAR_M)
-    x, y = points_cam[..., 0] / z, points_cam[..., 1] / z
-    bent_x, bent_y = distort(cameras, x, y)
-    K = cameras.K
-    u = K[..., 0, 0] * bent_x + K[..., 0, 1] * bent_y + K[..., 0, 2]
-    v = K[..., 1, 1] * bent_y + K[..., 1, 2]
+    z = np.maximum(points_cam[..., 2:], NEAR_M)
+    bent = points_cam[..., :2] / z
     # d(x, y) / d world = (r1 - x r3, r2 - y r3) / z, with the rows r1, r2, r3 of the rotation.
-    x_by_world = (R[..., 0, :] - x[..., None] * R[..., 2, :]) / z[..., None]
-    y_by_world = (R[..., 1, :] - y[..., None] * R[..., 2, :]) / z[..., None]
-    xx, xy, yx, yy = (slope[..., None] for slope in lens_derivative(cameras, x, y))
-    bent_x_by_world = xx * x_by_world + xy * y_by_world
-    bent_y_by_world = yx * x_by_world + yy * y_by_world
-    u_by_world = K[..., 0, 0, None] * bent_x_by_world + K[..., 0, 1, None] * bent_y_by_world
-    v_by_world = K[..., 1, 1, None] * bent_y_by_world
-    return np.stack([u, v], axis=-1), np.stack([u_by_world, v_by_world], axis=-2)
+    by_world = (R[..., :2, :] - bent[..., None] * R[..., 2:, :]) / z[..., None]
+    if cameras.dist.shape[-1]:
+        x, y = bent[..., 0], bent[..., 1]
+        xx, xy, yx, yy = (slope[..., None] for slope in lens_derivative(cameras, x, y))
+        x_by_world, y_by_world = by_world[..., 0, :], by_world[..., 1, :]
+        by_world = np.stack([xx * x_by_world + xy * y_by_world, yx * x_by_world + yy * y_by_world], axis=-2)
+        bent = np.stack(distort(cameras, x, y), axis=-1)
+    focal_px, skew_px = np.diagonal(cameras.K, axis1=-2, axis2=-1)[..., :2], cameras.K[..., 0, 1]
+    pixels, pixels_by_world = focal_px * bent, focal_px[..., None] * by_world
+    pixels[..., 0] += skew_px * bent[..., 1]
+    pixels_by_world[..., 0, :] += skew_px[..., None] * by_world[..., 1, :]
+    return pixels + cameras.K[..., :2, 2], pixels_by_world
 
 
 def _disagreement(

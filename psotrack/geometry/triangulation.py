@@ -6,8 +6,6 @@ solved by least squares. Pixels are undistorted first, so that the equations are
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -93,7 +91,9 @@ def solve_equations(
     A = (rows * scale[..., None, None]).reshape(*flat, 3)
     normal = A.swapaxes(-1, -2) @ A
     right_side = np.matvec(A.swapaxes(-1, -2), (right * scale[..., None]).reshape(flat))
-    solvable = np.linalg.cond(normal) < MAX_CONDITION
+    # Faster than `np.linalg.cond`, of few points.
+    lengths = np.linalg.svd(normal, compute_uv=False)
+    solvable = lengths[..., 0] < MAX_CONDITION * lengths[..., -1]
     point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right_side[..., None])
     return np.where(solvable[..., None], point[..., 0], np.nan)
 
@@ -105,7 +105,7 @@ def viewpoints(cameras: Camera) -> Int[np.ndarray, "cameras"]:
     """
     centre = cameras.centre_world
     label = np.arange(len(centre))
-    for a, b in combinations(range(len(centre)), 2):
-        if np.linalg.norm(centre[a] - centre[b]) < _NEAREST_M:
-            label[label == label[b]] = label[a]
+    apart_m = np.linalg.norm(centre[:, None] - centre, axis=-1)
+    for a, b in np.argwhere(np.triu(apart_m < _NEAREST_M, 1)).tolist():
+        label[label == label[b]] = label[a]
     return label

@@ -242,6 +242,7 @@ class Births:
     def __init__(self, cameras: Camera, limits: FlightLimits, rules: BirthRules = BirthRules()) -> None:
         self._cameras, self._limits, self._rules = cameras, limits, rules
         self._viewpoint = viewpoints(cameras)
+        self._at = self._viewpoint[:, None] == np.unique(self._viewpoint)
         self._clear_m = limits.bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
         self._paths: list[_Path] = []
         self._mean, self._covariance = np.empty((0, 6)), np.empty((0, 6, 6))
@@ -456,8 +457,7 @@ class Births:
         return np.clip(self._num_viewpoints(in_view), 2, TRUSTED_VIEWPOINTS)
 
     def _num_viewpoints(self, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:
-        at = self._viewpoint[:, None] == np.unique(self._viewpoint)
-        return (seen @ at > 0).sum(axis=-1)
+        return (seen @ self._at).sum(axis=-1)
 
     def _correct(self, number: int, one: Measurement) -> None:
         """Correct a followed place by a measurement."""
@@ -485,9 +485,9 @@ class Births:
             least = FOUND_BY_TWO
         if len(path.found) < least or path.num_seeing < MIN_SEEING_SHARE * path.num_should_see:
             return False
-        way_m = float(np.linalg.norm(path.places_m[-1] - path.places_m[0]))
-        fastest_m_s = FASTER * self._limits.max_speed_m_s
-        return way_m * self._limits.fps <= fastest_m_s * (max(path.found) - min(path.found))
+        (first, start), *_, (last, end) = path.found.items()
+        way_m = float(np.linalg.norm(end.position_m - start.position_m))
+        return way_m * self._limits.fps <= FASTER * self._limits.max_speed_m_s * (last - first)
 
     def _may_be_known(self, path: _Path) -> bool:
         """Whether a place was found often enough to be of a drone that was lost."""

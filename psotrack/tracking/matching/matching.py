@@ -82,10 +82,12 @@ def _ambiguity(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Flo
     """
     both = proposed.seen[:, None] & groups.seen
     same = proposed.detection[:, None] == groups.detection
-    off = proposed.point[:, None] - groups.point
-    elsewhere = np.einsum("pgi,gij,pgj->pg", off, np.linalg.inv(groups.covariance), off) > UNEXPLAINED_COST
-    rival = (both & same).any(axis=-1) & (both & ~same).any(axis=-1) & elsewhere
+    rival = (both & same).any(axis=-1) & (both & ~same).any(axis=-1)
     ambiguity = np.zeros(len(groups))
+    if rival.any():
+        off = proposed.point[:, None] - groups.point
+        squared = np.einsum("pgi,gij,pgj->pg", off, np.linalg.inv(groups.covariance), off)
+        rival &= squared > UNEXPLAINED_COST
     if not rival.any():
         return ambiguity
     exchanges = propose_exchanges(padded, groups, proposed, forced=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.geometry import Camera, undistort
+from psotrack.geometry import Camera, cross_matrices, undistort
 from psotrack.tracking.matching.groups import (
     UNEXPLAINED_COST,
     Groups,
@@ -36,7 +36,7 @@ def propose_groups(padded: PaddedSightings, priors: Priors, bounds_m: Float[np.n
     for _ in range(2):
         distance = squared_distances(padded, point[:, None], covariance[:, None])
         detection = np.where(distance.min(axis=-1) < UNEXPLAINED_COST, distance.argmin(axis=-1), -1)
-        _, first = np.unique(np.column_stack([detection, prior]), axis=0, return_index=True)
+        first = _first_of_equal(np.column_stack([detection, prior]))
         detection = detection[first]
         groups = make_groups(
             padded, priors, detection, np.zeros(detection.shape, bool), prior[first], point[first]
@@ -44,6 +44,13 @@ def propose_groups(padded: PaddedSightings, priors: Priors, bounds_m: Float[np.n
         groups = groups.only(are_in_bounds(groups.point, bounds_m))
         point, covariance, prior = groups.point, groups.covariance, groups.prior
     return groups.only(are_valid(padded, groups, bounds_m))
+
+
+def _first_of_equal(rows: Int[np.ndarray, "rows columns"]) -> Int[np.ndarray, "different"]:
+    """Index of the first of all equal rows, in the order of the rows' values; faster than `np.unique`."""
+    order = np.lexsort(rows.T[::-1])
+    ordered = rows[order]
+    return order[np.diff(ordered, axis=0, prepend=ordered[:1] - 1).any(axis=1)]
 
 
 def _pair_points(
@@ -102,13 +109,15 @@ def _add_expected(
     the predictions themselves.
     """
     expected, spread = priors.mean[:-1], np.linalg.inv(priors.normal[:-1])
-    off = point[:, None] - expected
-    apart = np.linalg.inv(covariance[:, None] + spread)
-    squared = (off[..., None, :] @ apart @ off[..., None])[..., 0, 0]
-    pair, known = np.nonzero(squared < UNEXPLAINED_COST)
-    gain = spread[known] @ apart[pair, known]
+    off, total = point[:, None] - expected, covariance[:, None] + spread
+    # Most pairs are farther than along the longest axis of a covariance, which is no longer than its trace.
+    reached = np.vecdot(off, off) < UNEXPLAINED_COST * np.trace(total, axis1=-2, axis2=-1)
+    off, apart = off[reached], np.linalg.inv(total[reached])
+    near = np.vecdot(off, np.matvec(apart, off)) < UNEXPLAINED_COST
+    known = np.nonzero(reached)[1][near]
+    gain = spread[known] @ apart[near]
     return (
-        np.concatenate([point, expected[known] + (gain @ off[pair, known][..., None])[..., 0], expected]),
+        np.concatenate([point, expected[known] + np.matvec(gain, off[near]), expected]),
         np.concatenate([covariance, spread[known] - gain @ spread[known], spread]),
         np.concatenate([np.full(len(point), -1), known, np.arange(len(expected))]),
     )
@@ -169,7 +178,7 @@ def _essential(T: Float[np.ndarray, "cameras 3 4"]) -> Float[np.ndarray, "camera
     R, t = T[..., :3], T[..., 3]
     R_ba = R @ R[:, None].swapaxes(-1, -2)
     t_ba = t - (R_ba @ t[:, None, :, None])[..., 0]
-    return np.cross(t_ba[..., None], R_ba, axisa=-2, axisb=-2, axisc=-2)
+    return cross_matrices(t_ba) @ R_ba
 
 
 def _homogeneous(x: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 3"]:
