@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.tracking.camera_errors.variance_components import FittedPlaces
+from psotrack.tracking.camera_errors.variance_components import FittedPlaces, of_rows
 from psotrack.tracking.camera_errors.views import CameraViews
 
 #: Numbers of frames of the windows that are compared.
@@ -151,9 +151,9 @@ def _against_others(
     The positions are eliminated: the left side is the part of the unit matrix that no position explains. A frame that
     is exposed later shows a body farther along its motion in the image, `per_s`, pixels per second.
     """
-    weight = used.shown.astype(float)
-    normal = np.einsum("rc,rcik,rcil->rkl", weight, used.jacobian, used.jacobian)
-    right = np.einsum("rc,rcik,rci->rk", weight, used.jacobian, used.residual_px)
+    jacobian = of_rows(np.where(used.shown[..., None, None], used.jacobian, 0.0))
+    normal = jacobian.swapaxes(-1, -2) @ jacobian
+    right = np.vecmat(of_rows(used.residual_px), jacobian)
     J = used.jacobian[:, camera]
     solved = J @ np.linalg.inv(normal)
     left = np.eye(2) - solved @ J.swapaxes(-1, -2)

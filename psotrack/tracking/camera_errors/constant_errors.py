@@ -29,6 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import eigh  # NumPy's waits long for threads of BLAS where processors are shared
 from scipy.special import fdtri, gammaincinv
 
 from psotrack.tracking.camera_errors.variance_components import FittedPlaces, weighted_residuals
@@ -52,15 +53,25 @@ class ConstantErrors:
         clock_s: (cameras,), how late each camera's clock shows a drone, relative to the others, seconds.
         turn_std_rad: standard deviation of a turn about one axis, radians.
         clock_std_s: standard deviation of a clock, seconds.
-        covariance: (4 cameras, 4 cameras), of turns about x, y and z, radians, and clock, seconds, camera by camera;
-            larger where residuals show little.
+        information: (4 cameras, 4 cameras), what the residuals show of turns about x, y and z, and clock, camera by
+            camera, in units of `unit`.
+        likeliest, wide: (4 cameras,), likeliest and wide variances of these, in the same units.
+        unit: (4 cameras,), the units, radians and seconds.
     """
 
     turn_rad: Float[np.ndarray, "cameras 3"]
     clock_s: Float[np.ndarray, "cameras"]
     turn_std_rad: float
     clock_std_s: float
-    covariance: Float[np.ndarray, "all all"]
+    information: Float[np.ndarray, "all all"]
+    likeliest: Float[np.ndarray, "all"]
+    wide: Float[np.ndarray, "all"]
+    unit: Float[np.ndarray, "all"]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "all all"]:
+        """(4 cameras, 4 cameras), of turns, radians, and clocks, seconds; larger where residuals show little."""
+        return _covariance(self.information, self.likeliest, self.wide) * np.outer(self.unit, self.unit)
 
 
 def fit_constant_errors(
@@ -98,7 +109,7 @@ def fit_constant_errors(
     mean = np.where(kinds, *(np.diag(information)[which].mean() for which in (kinds, ~kinds)))
     unit = 1 / np.sqrt(np.where(mean > 0, mean, 1.0))
     information, score = information * np.outer(unit, unit), score * unit
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = eigh(information)
     kept = values > _LEAST_INFORMATION * max(values[-1], np.finfo(float).tiny)
     values, vectors = values[kept], vectors[:, kept]
     # Directions and columns of A in units of the noise.
@@ -118,7 +129,10 @@ def fit_constant_errors(
         clock_s=fitted[:, 3],
         turn_std_rad=float(deviation[0]),
         clock_std_s=float(deviation[1]),
-        covariance=_covariance(information / inflation, likeliest, wide) * np.outer(unit, unit),
+        information=information / inflation,
+        likeliest=likeliest,
+        wide=wide,
+        unit=unit,
     )
 
 
@@ -130,7 +144,7 @@ def _covariance(
     """Covariance of turns and clocks from their likeliest and wide variances and the information about them."""
     root = np.sqrt(wide)
     # (1 + R A R)⁻¹ by eigenvalues: where the noise is next to nothing, 1 is lost beside R A R in the sum.
-    values, vectors = np.linalg.eigh(root[:, None] * information * root)
+    values, vectors = eigh(root[:, None] * information * root)
     unseen = (vectors / (1 + np.maximum(values, 0.0))) @ vectors.T
     more = np.sqrt(np.maximum(wide - likeliest, 0.0))
     return np.diag(likeliest) + more[:, None] * unseen * more

@@ -44,11 +44,18 @@ class FittedPlaces:
     @property
     def determined(self) -> Bool[np.ndarray, "rows"]:
         """(rows,), whether the residuals say something: two cameras from two sides."""
-        weight = self.shown.astype(float)
-        normal = np.einsum("rc,rcik,rcil->rkl", weight, self.jacobian, self.jacobian)
+        jacobian = of_rows(np.where(self.shown[..., None, None], self.jacobian, 0.0))
+        normal = jacobian.swapaxes(-1, -2) @ jacobian
         scale = np.trace(normal, axis1=-2, axis2=-1)
         least = np.linalg.eigvalsh(normal / np.where(scale > 0, scale, 1.0)[:, None, None])[:, 0]
         return np.asarray((self.shown.sum(axis=-1) >= 2) & (scale > 0) & (least > 1e-9))
+
+
+def of_rows(
+    values: Float[np.ndarray, "rows cameras 2 *rest"],
+) -> Float[np.ndarray, "rows equations *rest"]:
+    """Values of each row's cameras as one axis of equations: sums over it are products of matrices."""
+    return values.reshape(len(values), 2 * values.shape[1], *values.shape[3:])
 
 
 def weighted_residuals(
@@ -66,9 +73,11 @@ def weighted_residuals(
     """
     residual_px = np.where(places.shown[..., None], places.residual_px, 0.0)
     weighted = weight[..., None] * places.jacobian
-    inverse = np.linalg.inv(np.einsum("rcik,rcil->rkl", weighted, places.jacobian))
-    moved_m = np.einsum("rkl,rl->rk", inverse, np.einsum("rcil,rci->rl", weighted, residual_px))
-    return weight * residual_px - np.einsum("rcik,rk->rci", weighted, moved_m), weighted, inverse
+    equations = of_rows(weighted)
+    inverse = np.linalg.inv(equations.swapaxes(-1, -2) @ of_rows(places.jacobian))
+    moved_m = np.matvec(inverse, np.vecmat(of_rows(residual_px), equations))
+    explained = np.matvec(equations, moved_m).reshape(residual_px.shape)
+    return weight * residual_px - explained, weighted, inverse
 
 
 def camera_variances(
@@ -97,7 +106,8 @@ def camera_variances(
         weight = shown / variance_px2
         left, weighted, inverse = weighted_residuals(places, weight)
         # Sums over the rows of (P r)² and of the diagonal of P.
-        leverage = np.einsum("rcik,rkl,rcil->ci", weighted, inverse, weighted, optimize=True)
+        equations = of_rows(weighted)
+        leverage = np.vecdot(equations @ inverse, equations).sum(axis=0).reshape(seen.shape)
         found, expected = np.square(left).sum(axis=0) / inflation, (weight.sum(axis=0) - leverage) / inflation
         # The common variance counts as some more residuals of each camera.
         told = np.where(seen, expected, 0.0)
