@@ -91,9 +91,8 @@ def solve_equations(
     A = (rows * scale[..., None, None]).reshape(*flat, 3)
     normal = A.swapaxes(-1, -2) @ A
     right_side = np.matvec(A.swapaxes(-1, -2), (right * scale[..., None]).reshape(flat))
-    # Faster than `np.linalg.cond`, of few points.
-    lengths = np.linalg.svd(normal, compute_uv=False)
-    solvable = lengths[..., 0] < MAX_CONDITION * lengths[..., -1]
+    values = np.linalg.eigvalsh(normal)
+    solvable = values[..., -1] < MAX_CONDITION * values[..., 0]
     point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right_side[..., None])
     return np.where(solvable[..., None], point[..., 0], np.nan)
 

@@ -175,8 +175,12 @@ def _linearise(
     there &= there.sum(axis=-1, keepdims=True) >= 2
     e = np.where(there[..., None], e, 0.0)
     weights = _robust_weights(e, there)
-    point_normal = np.einsum("fdc,fdcik,fdcil->fdkl", weights, J, J)
-    known = np.linalg.cond(point_normal) < MAX_CONDITION
+    weighted = weights[..., None, None] * J
+    # The cameras' equations on one axis, so that sums over it are products of matrices.
+    equations, weighted_equations = (each.reshape(*e.shape[:2], 2 * e.shape[2], 3) for each in (J, weighted))
+    point_normal = weighted_equations.swapaxes(-1, -2) @ equations
+    values = np.linalg.eigvalsh(point_normal)
+    known = values[..., -1] < MAX_CONDITION * values[..., 0]
     point_normal = np.where(known[..., None, None], point_normal, np.eye(3))
     squares, total = float((weights * (e**2).sum(axis=-1)).sum()), float(weights.sum())
     # Each triangulated point uses up three degrees of freedom.
@@ -188,14 +192,14 @@ def _linearise(
     spread_m2 = np.where(known, variance_px2 * np.trace(inverse, axis1=-2, axis2=-1), np.inf)
     velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, reach)
     moving = known & ((velocity_m**2).sum(axis=-1) > _CLEARLY**2 * noise_m2)
-    u = np.einsum("fdcij,fdj->fdci", J, np.where(moving[..., None], velocity_m, 0.0))
-    coupling = np.einsum("fdc,fdcik,fdci->fdkc", weights, J, u)
+    u = np.matvec(equations, np.where(moving[..., None], velocity_m, 0.0)).reshape(e.shape)
+    coupling = np.vecmat(u, weighted).swapaxes(-1, -2)
     gain = inverse @ coupling
-    normal = -np.einsum("fdkb,fdkc->fdbc", coupling, gain)
+    normal = -(coupling.swapaxes(-1, -2) @ gain)
     index = np.arange(len(offset_frames))
-    normal[:, :, index, index] += np.einsum("fdc,fdci,fdci->fdc", weights, u, u)
-    gradient = np.einsum("fdc,fdci,fdci->fdc", weights, u, e)
-    gradient -= np.einsum("fdlc,fdl->fdc", gain, np.einsum("fdc,fdcik,fdci->fdk", weights, J, e))
+    normal[:, :, index, index] += weights * np.vecdot(u, u)
+    moved = np.vecmat(e.reshape(equations.shape[:-1]), weighted_equations)
+    gradient = weights * np.vecdot(u, e) - np.vecmat(moved, gain)
     return _System(offset_frames, normal, gradient, weights, variance_px2)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -264,21 +265,20 @@ def _foreground_middles(
     centre, half = (
         _middles(values, box) / reduction for values in (sightings.centre_px + 0.5, sightings.size_px / 2)
     )
-    low, high = centre - half - _MARGIN_CELLS, centre + half + _MARGIN_CELLS
+    ends = np.stack([centre - half - _MARGIN_CELLS, centre + half + _MARGIN_CELLS], axis=-2)
+    # Boxes may reach beyond the last row or column, but not before the first ones.
+    cells = np.maximum(np.rint(np.nan_to_num(ends)), 0.0).astype(int)
     places = np.full(centre.shape, np.nan)
-    height, width = silhouettes.shape
     for first in range(0, silhouettes.num_frames, _CHUNK_FRAMES):
-        chunk = silhouettes.read(first, min(first + _CHUNK_FRAMES, silhouettes.num_frames))
-        for at, drone, camera in np.argwhere(box[first : first + len(chunk)] >= 0).tolist():
-            where = (first + at, drone, camera)
-            (x0, y0), (x1, y1) = (np.rint(ends[where]).astype(int) for ends in (low, high))
-            x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
-            shown = chunk[at, camera, y0:y1, x0:x1].astype(float)
-            columns, rows, total = shown.sum(axis=0), shown.sum(axis=1), shown.sum()
-            if total > 0:
-                x = x0 + 0.5 + columns @ np.arange(len(columns)) / total
-                y = y0 + 0.5 + rows @ np.arange(len(rows)) / total
-                places[where] = reduction * x - 0.5, reduction * y - 0.5
+        frames = slice(first, first + _CHUNK_FRAMES)
+        for camera, array in enumerate(silhouettes.arrays):
+            chunk = np.asarray(array[frames])
+            for at, drone in np.argwhere(box[frames, :, camera] >= 0).tolist():
+                (x0, y0), (x1, y1) = cells[first + at, drone, camera].tolist()
+                shown = cv2.moments(chunk[at, y0:y1, x0:x1])
+                if shown["m00"] > 0:
+                    x, y = x0 + 0.5 + shown["m10"] / shown["m00"], y0 + 0.5 + shown["m01"] / shown["m00"]
+                    places[first + at, drone, camera] = reduction * x - 0.5, reduction * y - 0.5
     return places
 
 
