@@ -59,7 +59,9 @@ class Groups:
         return self.gain.sum(axis=-1) - self.base_cost
 
     def only(self, index: np.ndarray) -> Groups:
-        """Select the groups at `index`."""
+        """Select the groups at `index`; mostly a mask keeps all."""
+        if index.dtype == bool and index.all():
+            return self
         return Groups(**{name: value[index] for name, value in vars(self).items()})
 
     def __add__(self, other: Groups) -> Groups:
@@ -91,7 +93,7 @@ def make_groups(
     own = priors.equations(prior)
     point, covariance = solve_points(normal.sum(axis=1) + own[0], right.sum(axis=1) + own[1])
     distance = squared_distances(padded, point[:, None])
-    distance = np.take_along_axis(distance, detection[..., None], axis=-1)[..., 0]
+    distance = distance[np.arange(len(detection))[:, None], np.arange(len(detection.T)), detection]
     off = point - priors.mean[prior]
     return Groups(
         detection=detection,

@@ -77,7 +77,7 @@ def _pair_points(
     for _ in range(2):
         normal, right = normal_equations(padded, camera, detection, depth)
         point, covariance = solve_points(normal.sum(axis=1) + room, right.sum(axis=1) + middle)
-        depth = np.take_along_axis(padded.depth(point), camera, axis=-1)
+        depth = padded.depth(point)[np.arange(len(point))[:, None], camera]
     if by_place:
         # Where only two viewpoints have the place in view, no other camera can agree.
         kept |= padded.required_viewpoints(point, np.full(len(point), BY_PLACE)) == 2
