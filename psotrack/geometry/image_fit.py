@@ -75,9 +75,6 @@ def fit_in_image(
         tried = _linearise(cameras, points_px, scale, fit.position_m + step_m)
         better = tried.cost < fit.cost
         damping = np.where(better, _LEAST_DAMPING, damping * _MORE_DAMPING)
-        if better.all():
-            fit = tried
-            continue
         fit = _Fit(
             *(
                 np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
@@ -85,8 +82,7 @@ def fit_in_image(
             )
         )
     information = fit.information
-    lengths = np.linalg.svd(information, compute_uv=False)
-    is_fixed = has_start & (lengths[:, 0] * np.finfo(float).eps < lengths[:, -1])
+    is_fixed = has_start & (np.linalg.cond(information) < 1 / np.finfo(float).eps)
     covariance_m2 = np.linalg.inv(np.where(is_fixed[:, None, None], information, np.eye(3)))
     return ImageFit(
         np.where(is_fixed[:, None], fit.position_m, np.nan),

@@ -177,7 +177,8 @@ def _linearise(
     weights = _robust_weights(e, there)
     weighted = weights[..., None, None] * J
     # The cameras' equations on one axis, so that sums over it are products of matrices.
-    equations, weighted_equations = (each.reshape(*e.shape[:2], 2 * e.shape[2], 3) for each in (J, weighted))
+    sides = (*e.shape[:2], 2 * e.shape[2], 3)
+    equations, weighted_equations = J.reshape(sides), weighted.reshape(sides)
     point_normal = weighted_equations.swapaxes(-1, -2) @ equations
     values = np.linalg.eigvalsh(point_normal)
     known = values[..., -1] < MAX_CONDITION * values[..., 0]

@@ -62,10 +62,9 @@ def find_blobs(
     # Most of a silhouette is empty: only the part about the foreground is looked at, with cells for the closing.
     x, y, width, height = cv2.boundingRect(coverage)
     left, top = max(x - _BESIDE, 0), max(y - _BESIDE, 0)
-    part = coverage[top : y + height + _BESIDE, left : x + width + _BESIDE]
-    foreground = (part >= MIN_COVERAGE).view(np.uint8)
+    part = coverage[top : y + height + _BESIDE, left : x + width + _BESIDE] >= MIN_COVERAGE
     # In thin silhouettes, gaps of one cell separate rotors and arms from the body.
-    closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, _CLOSING)
+    closed = cv2.morphologyEx(part.view(np.uint8), cv2.MORPH_CLOSE, _CLOSING)
     # Outlines instead of labels, because most of a silhouette is empty: labels would be written to every cell of it.
     outlines, levels = cv2.findContours(closed, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     # OpenCV lists the outlines from below, and those of holes with the number of the blob around them.

@@ -328,10 +328,6 @@ class Births:
         seen_enough = (crossed.expected >= 0) | (num_seeing >= MIN_SEEING_SHARE * num_should_see)
         counts = seen_enough & self._counts(crossed, known)
         required = self._required_viewpoints(in_view)
-        followed = np.flatnonzero(counts & (crossed.expected >= 0))
-        self._correct(
-            crossed.expected[followed], crossed.position_m[followed], crossed.covariance_m2[followed]
-        )
         begun: list[tuple[_Path, Measurement]] = []
         # Followed places first: a new position may be a part of one of them.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
@@ -344,13 +340,13 @@ class Births:
                 number = int(distance_m.argmin())
                 if not self._paths[number].missed:
                     continue
-                self._correct(np.array([number]), one.position_m[None], one.covariance_m2[None])
             if number < 0:
                 path = _Path(self._num_begun, instant, usual_dispersion)
                 self._num_begun += 1
                 begun.append((path, one))
             else:
                 path = self._paths[number]
+                self._correct(number, one)
             path.found[instant] = one
             path.frames.append(self._frame)
             if len(path.frames) > MOST_REMEMBERED:
@@ -463,18 +459,13 @@ class Births:
     def _num_viewpoints(self, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:
         return (seen @ self._at).sum(axis=-1)
 
-    def _correct(
-        self,
-        numbers: Int[np.ndarray, "found"],
-        position_m: Float[np.ndarray, "found 3"],
-        covariance_m2: Float[np.ndarray, "found 3 3"],
-    ) -> None:
-        """Correct some followed places by what was measured of each."""
-        covariance = self._covariance[numbers]
-        gain = np.linalg.solve(covariance[:, :3, :3] + covariance_m2, covariance[:, :3]).swapaxes(-1, -2)
-        self._mean[numbers] += np.matvec(gain, position_m - self._mean[numbers, :3])
-        after = covariance - gain @ covariance[:, :3]
-        self._covariance[numbers] = (after + after.swapaxes(-1, -2)) / 2
+    def _correct(self, number: int, one: Measurement) -> None:
+        """Correct a followed place by a measurement."""
+        covariance = self._covariance[number]
+        gain = np.linalg.solve(covariance[:3, :3] + one.covariance_m2, covariance[:3]).T
+        self._mean[number] += gain @ (one.position_m - self._mean[number, :3])
+        after = covariance - gain @ covariance[:3]
+        self._covariance[number] = (after + after.T) / 2
 
     def _is_chance(self, path: _Path) -> bool:
         """Whether a place comes from chance crossings of lines, or from a drone that departs from its ghost."""
@@ -494,8 +485,8 @@ class Births:
             least = FOUND_BY_TWO
         if len(path.found) < least or path.num_seeing < MIN_SEEING_SHARE * path.num_should_see:
             return False
-        (first, start), *_, (last, end) = path.found.items()
-        way_m = float(np.linalg.norm(end.position_m - start.position_m))
+        first, last = min(path.found), max(path.found)
+        way_m = float(np.linalg.norm(path.found[last].position_m - path.found[first].position_m))
         return way_m * self._limits.fps <= FASTER * self._limits.max_speed_m_s * (last - first)
 
     def _may_be_known(self, path: _Path) -> bool:

@@ -53,25 +53,15 @@ class ConstantErrors:
         clock_s: (cameras,), how late each camera's clock shows a drone, relative to the others, seconds.
         turn_std_rad: standard deviation of a turn about one axis, radians.
         clock_std_s: standard deviation of a clock, seconds.
-        information: (4 cameras, 4 cameras), what the residuals show of turns about x, y and z, and clock, camera by
-            camera, in units of `unit`.
-        likeliest, wide: (4 cameras,), likeliest and wide variances of these, in the same units.
-        unit: (4 cameras,), the units, radians and seconds.
+        covariance: (4 cameras, 4 cameras), of turns about x, y and z, radians, and clock, seconds, camera by camera;
+            larger where residuals show little.
     """
 
     turn_rad: Float[np.ndarray, "cameras 3"]
     clock_s: Float[np.ndarray, "cameras"]
     turn_std_rad: float
     clock_std_s: float
-    information: Float[np.ndarray, "all all"]
-    likeliest: Float[np.ndarray, "all"]
-    wide: Float[np.ndarray, "all"]
-    unit: Float[np.ndarray, "all"]
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "all all"]:
-        """(4 cameras, 4 cameras), of turns, radians, and clocks, seconds; larger where residuals show little."""
-        return _covariance(self.information, self.likeliest, self.wide) * np.outer(self.unit, self.unit)
+    covariance: Float[np.ndarray, "all all"]
 
 
 def fit_constant_errors(
@@ -129,10 +119,7 @@ def fit_constant_errors(
         clock_s=fitted[:, 3],
         turn_std_rad=float(deviation[0]),
         clock_std_s=float(deviation[1]),
-        information=information / inflation,
-        likeliest=likeliest,
-        wide=wide,
-        unit=unit,
+        covariance=_covariance(information / inflation, likeliest, wide) * np.outer(unit, unit),
     )
 
 

@@ -34,8 +34,8 @@ from psotrack.tracking.motion import white_jerk_noise
 _WINDOW_S, _NUM_LEVELS = 1.0, 8
 #: Nothing is known of the cameras' errors beforehand.
 NO_ERRORS = ErrorSettings()
-#: Largest number of doublings of the number of frames after which a filter has settled.
-_MOST_DOUBLINGS = 60
+#: Number of doublings of the number of frames after which every filter has settled.
+_DOUBLINGS = 30
 
 
 def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarray, "frames drones 3 3"]:
@@ -245,7 +245,14 @@ def filtered_variances(
     # A measurement is the position plus the fading error plus white noise.
     H = np.array([1.0, 0.0, 0.0, 1.0])
     white = (assumed.variance_m2 - assumed.fading_m2) / unit_m2
-    P = _steady_covariance(F[:4, :4], H, noise[:4, :4], white)
+    # The covariance of the predicted state in the end, by doubling the number of frames (B. D. O. Anderson,
+    # International Journal of Control 28(2), 1978). SciPy's solver uses BLAS, whose threads wait long where processors
+    # are shared.
+    onward, told, P = F[:4, :4].T, np.outer(H, H) / white, noise[:4, :4]
+    for _ in range(_DOUBLINGS):
+        solved = np.linalg.inv(np.eye(4) + told @ P)
+        told = told + onward @ solved @ told @ onward.T
+        onward, P = onward @ solved @ onward, P + onward.T @ P @ solved @ onward
     gain = P @ H / (H @ P @ H + white)
     stated = P[0, 0] - gain[0] * (P @ H)[0]
     # With true minus estimated values, the innovation is the error of the position + the real fading error - the
@@ -259,31 +266,3 @@ def filtered_variances(
     ahead = correct @ F
     real = np.linalg.solve(np.eye(25) - np.kron(ahead, ahead), driven.ravel())[0]
     return float(stated * unit_m2), float(real * unit_m2)
-
-
-def _steady_covariance(
-    F: Float[np.ndarray, "states states"],
-    H: Float[np.ndarray, "states"],
-    noise: Float[np.ndarray, "states states"],
-    white: float,
-) -> Float[np.ndarray, "states states"]:
-    """Covariance of the state that a filter predicts in the end, by doubling the number of frames (B. D. O. Anderson,
-    International Journal of Control 28(2), 1978).
-
-    `scipy.linalg.solve_discrete_are` uses BLAS, whose threads wait long where processors are shared.
-
-    Args:
-        F: transition of the state from frame to frame.
-        H: what a measurement shows of the state.
-        noise: covariance of the state's noise from frame to frame.
-        white: variance of a measurement.
-    """
-    ahead, told, P = F.T, np.outer(H, H) / white, noise
-    for _ in range(_MOST_DOUBLINGS):
-        solved = np.linalg.inv(np.eye(len(H)) + told @ P)
-        more = ahead.T @ P @ solved @ ahead
-        told = told + ahead @ solved @ told @ ahead.T
-        ahead, P = ahead @ solved @ ahead, P + (more + more.T) / 2
-        if (np.diag(more) <= np.finfo(float).eps * np.diag(P)).all():
-            break
-    return P

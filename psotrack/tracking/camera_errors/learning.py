@@ -98,12 +98,11 @@ def autocorrelation_of(
         usual: the result where too few frames show it.
     """
     num_frames = len(residual)
-    values = np.where(shown[..., None], residual, 0.0)
+    values = np.where(shown[..., None], residual, 0.0).reshape(num_frames, -1)
     longest = int(min(_LONGEST_FRACTION * num_frames, _LONGEST_S / dt_s))
     lags = np.unique(np.round(np.concatenate([[0], np.geomspace(1, max(longest, 1), _NUM_LAGS)])).astype(int))
     pairs = np.array([(shown[: num_frames - lag] & shown[lag:]).sum() for lag in lags])
     # Not by BLAS, whose threads wait long where processors are shared.
-    values = values.reshape(num_frames, -1)
     sums = np.array([np.einsum("fi,fi", values[: num_frames - lag], values[lag:]) for lag in lags])
     enough = pairs >= _LEAST_PAIRS
     if enough.sum() < _LEAST_LAGS or not enough[0] or not sums[0] > 0:

@@ -51,9 +51,7 @@ class FittedPlaces:
         return np.asarray((self.shown.sum(axis=-1) >= 2) & (scale > 0) & (least > 1e-9))
 
 
-def of_rows(
-    values: Float[np.ndarray, "rows cameras 2 *rest"],
-) -> Float[np.ndarray, "rows equations *rest"]:
+def of_rows(values: Float[np.ndarray, "rows cameras 2 *rest"]) -> Float[np.ndarray, "rows all *rest"]:
     """Values of each row's cameras as one axis of equations: sums over it are products of matrices."""
     return values.reshape(len(values), 2 * values.shape[1], *values.shape[3:])
 
@@ -76,8 +74,7 @@ def weighted_residuals(
     equations = of_rows(weighted)
     inverse = np.linalg.inv(equations.swapaxes(-1, -2) @ of_rows(places.jacobian))
     moved_m = np.matvec(inverse, np.vecmat(of_rows(residual_px), equations))
-    explained = np.matvec(equations, moved_m).reshape(residual_px.shape)
-    return weight * residual_px - explained, weighted, inverse
+    return weight * residual_px - np.matvec(equations, moved_m).reshape(residual_px.shape), weighted, inverse
 
 
 def camera_variances(

@@ -135,9 +135,6 @@ def propose_exchanges(
         )
         kind, which = kind[kept], which[kept]
         take, share, value = takes[kind, which], shares[kind, which], values[kind, which]
-        if not len(which):
-            none = np.zeros((0, *groups.seen.shape), bool)
-            return Exchanges(which, take, share, value, none, none[..., 0])
     rest = groups.seen & ~(take[:, None] & (owner[which, None] == np.arange(len(groups))[:, None]))
     broken = ~have_enough_viewpoints(padded, rest & ~groups.shared, rest, groups.min_viewpoints)
     broken |= (proposed.prior[which, None] == groups.prior) & (groups.prior >= 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from statistics import median
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -123,7 +122,7 @@ class Expected:
     @property
     def usual(self) -> float:
         """The ratio for detections of a drone that is not expected: the same noise as that of the known drones."""
-        return median(self.dispersion.tolist()) if len(self.dispersion) else self.usual_dispersion
+        return float(np.median(self.dispersion)) if len(self.dispersion) else self.usual_dispersion
 
 
 def crossings(

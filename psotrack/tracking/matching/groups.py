@@ -59,9 +59,7 @@ class Groups:
         return self.gain.sum(axis=-1) - self.base_cost
 
     def only(self, index: np.ndarray) -> Groups:
-        """Select the groups at `index`; mostly a mask keeps all."""
-        if index.dtype == bool and index.all():
-            return self
+        """Select the groups at `index`."""
         return Groups(**{name: value[index] for name, value in vars(self).items()})
 
     def __add__(self, other: Groups) -> Groups:
@@ -193,13 +191,8 @@ def squared_distances(
     Returns:
         (groups, cameras, padded), infinite for padding, and for points that are not in front of the camera.
     """
-    R, t = padded.T[..., :3], padded.T[..., 3]
-    # Where the cameras share a point, one product for all cameras is faster than one for each.
-    shared = point.shape[1] == 1
-    turned = (
-        (point[:, 0] @ R.reshape(-1, 3).T).reshape(len(point), *t.shape) if shared else np.matvec(R, point)
-    )
-    in_camera = turned + t
+    R = padded.T[..., :3]
+    in_camera = np.matvec(R, point) + padded.T[..., 3]
     ahead = in_camera[..., 2:] > NEAR_M
     depth = np.where(ahead, in_camera[..., 2:], 1.0)
     x = in_camera[..., :2] / depth
@@ -210,7 +203,8 @@ def squared_distances(
     if covariance is None:
         return np.where(there, (dx * dx + dy * dy) / variance, np.inf)
     J = (R[:, :2] - x[..., None] * R[:, 2:]) / depth[..., None]
-    rows = J.reshape(len(J), 1, 2 * len(R), 3) if shared else J
+    # Where the cameras share a covariance, one product for all of them is faster than one for each.
+    rows = J.reshape(len(J), 1, 2 * len(R), 3) if covariance.shape[1] == 1 else J
     JC = (rows @ covariance).reshape(J.shape)
     a, b, c = (np.vecdot(JC[..., i, :], J[..., j, :])[..., None] for i, j in ((0, 0), (0, 1), (1, 1)))
     a, c = a + variance, c + variance

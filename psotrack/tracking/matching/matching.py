@@ -82,12 +82,10 @@ def _ambiguity(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Flo
     """
     both = proposed.seen[:, None] & groups.seen
     same = proposed.detection[:, None] == groups.detection
-    rival = (both & same).any(axis=-1) & (both & ~same).any(axis=-1)
+    off = proposed.point[:, None] - groups.point
+    elsewhere = np.einsum("pgi,gij,pgj->pg", off, np.linalg.inv(groups.covariance), off) > UNEXPLAINED_COST
+    rival = (both & same).any(axis=-1) & (both & ~same).any(axis=-1) & elsewhere
     ambiguity = np.zeros(len(groups))
-    if rival.any():
-        off = proposed.point[:, None] - groups.point
-        squared = np.einsum("pgi,gij,pgj->pg", off, np.linalg.inv(groups.covariance), off)
-        rival &= squared > UNEXPLAINED_COST
     if not rival.any():
         return ambiguity
     exchanges = propose_exchanges(padded, groups, proposed, forced=True)
