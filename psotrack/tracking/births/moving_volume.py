@@ -6,6 +6,7 @@ of frames, drones are therefore looked for in a region so wide that no drone is 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,8 +22,9 @@ from psotrack.tracking.births.initial_state import room_bounds
 from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
 from psotrack.trajectories import Tracks
 
-#: Least number of windows; frames of a window, enough for a drone to be born before two cameras that miss it at times;
-#: share of the frames of a long recording of detections in which windows are.
+#: Number of windows, of silhouettes at most and of detections at least; frames of a window, enough for a drone to be
+#: born before two cameras that miss it at times; share of the frames of a long recording of detections in which windows
+#: are.
 WINDOWS, WINDOW_FRAMES, WINDOWS_SHARE = 12, 30, 0.2
 #: Time between two frames of a window, seconds; at lower rates, one frame.
 STEP_S = 0.04
@@ -215,14 +217,18 @@ def moving_points(
         frames = np.flatnonzero(np.sum(by_viewpoint, axis=0) >= 2)
         # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
         rules = replace(rules, min_viewpoints=2)
-    step, count = max(1, round(STEP_S * fps)), WINDOWS
+    step = max(1, round(STEP_S * fps))
+    windows_long = len(frames) / (step * WINDOW_FRAMES)
     if isinstance(found, Sightings):
-        count = max(count, round(WINDOWS_SHARE * len(frames) / (step * WINDOW_FRAMES)))
+        count = max(WINDOWS, round(WINDOWS_SHARE * windows_long))
+    else:
+        # Windows of a short recording hardly overlap: a frame of silhouettes takes 5 ms.
+        count = min(WINDOWS, math.ceil(windows_long))
     last = 0 if not len(frames) else int(frames[-1])
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
     starts = starts[np.unique(np.linspace(0, len(starts) - 1, min(count, len(starts))).round().astype(int))]
     points, limits = [], FlightLimits(fps / step, wide_bounds(rig), FASTEST_M_S)
-    # The last window ends at the last of the frames. Windows of a short recording overlap.
+    # The last window ends at the last of the frames.
     windows = [
         np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step) for first in starts.tolist()
     ]
