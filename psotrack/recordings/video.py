@@ -280,12 +280,12 @@ def read_frames(
     with open_capture(video.path) as capture:
         for index in range(video.num_frames):
             if reached < index:
-                if not _grab(capture):
-                    if frame is None or not video.is_timed or video.num_frames - index > _END_S * video.fps:
-                        raise TruncatedVideoError(video, index)
+                if _grab(capture):
+                    reached = max(index, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
+                elif index and video.is_timed and video.num_frames - index <= _END_S * video.fps:
                     reached = video.num_frames
                 else:
-                    reached = max(index, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
+                    raise TruncatedVideoError(video, index)
             if index % step:
                 continue
             if reached == index or frame is None:

@@ -152,6 +152,16 @@ def test_frames_that_can_be_decoded_and_their_times(case, tmp_path, caplog):
     np.testing.assert_array_equal(frame_times(stated).time_s, np.arange(len(ticks)) / 25.0)
 
 
+def test_last_frames_that_cannot_be_decoded_show_the_picture_before(tmp_path):
+    """No end is decoded when a video is opened."""
+    packets = [*encoded(tmp_path, "VP80", 20), *[(np.zeros(40, np.uint8), 0.0)] * 4]
+    shown = [
+        frame.copy() for frame in read_frames(probe(packed(tmp_path / "a.mkv", packets, range(24), "VP80")))
+    ]
+    assert len(shown) == 24
+    np.testing.assert_array_equal(shown[19], shown[23])
+
+
 def test_a_codec_that_cannot_be_decoded_is_named(tmp_path):
     path = mp4(tmp_path, range(9), "mp4v")
     words = "a.mp4: expected a video that can be decoded, found 9 frames of the codec FMP4", "-c:v libx264"
