@@ -30,6 +30,7 @@ from typing import Any
 
 import _results
 import cv2
+import msgspec
 import numpy as np
 import pandas as pd
 import psutil
@@ -37,6 +38,8 @@ from _sequences import simulated
 
 from psotrack.recordings import VideoInfo
 from psotrack.recordings.datasets import open_recording
+from psotrack.simulation import SimulationSettings, scenario, simulate
+from psotrack.support import progress_bar
 
 
 def main() -> None:
@@ -48,6 +51,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the recordings")
     parser.add_argument("--sequence", type=Path, help="a recording of your own")
     parser.add_argument("--runs", type=int, default=64, help="batch: runs at once")
+    parser.add_argument("--backgrounds", nargs="+", default=["living", "mog2"], help="videos: models")
     parser.add_argument("--frames", type=int, help="number of first frames [default: all]")
     parser.add_argument("--repeats", type=int, default=2, help="timed repeats; medians are printed")
     parser.add_argument("--device", choices=["cpu", "gpu"], help="batch: where it computes")
@@ -55,8 +59,7 @@ def main() -> None:
     options = parser.parse_args()
     name, measure = MEASURES[options.what]
     run = _results.Run(name)
-    folder = options.sequence or simulated("S02_D4_A", options.data, 0)
-    rows, figures = measure(folder, options)
+    rows, figures = measure(options)
     print(
         pd.DataFrame(rows).to_string(index=False, float_format="%.3g")
         if rows
@@ -66,11 +69,11 @@ def main() -> None:
         run.save(options.results, rows=pd.DataFrame(rows) if rows else None, figures=figures)
 
 
-def videos(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def videos(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Real-time factors and seconds of all stages, from the videos to the tracks, beside the floor."""
     rows = []
-    for loops, background in itertools.product((None,) if options.sequence else (1, 6), ("living", "mog2")):
-        sequence = folder if loops is None else h264(folder, options.data, loops)
+    for seconds, background in itertools.product([0] if options.sequence else [10, 60], options.backgrounds):
+        sequence = options.sequence or h264(options.data, seconds)
         recording = open_recording(sequence).usable(num_frames=options.frames)
         words = ("track", sequence, "--frames", recording.num_frames, "--background", background)
         runs = []
@@ -94,8 +97,7 @@ def videos(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, An
                 "cold_compile_s": runs[0][0]["seconds"]["compile"],
             }
         )
-    codec = _codec(next(iter(recording.videos.values())))
-    return rows, {"recording": recording.name, "cameras": len(recording.rig), "codec": codec}
+    return rows, {"recording": recording.name, "cameras": len(recording.rig)}
 
 
 def _walls(record: dict[str, Any]) -> dict[str, float]:
@@ -135,41 +137,35 @@ def _floor(path: str) -> None:
         read, frame = capture.read(frame)
 
 
-def h264(folder: Path, data: Path, loops: int) -> Path:
-    """A recording in H.264, as most cameras write it, made by FFmpeg; further loops go backwards and forwards."""
-    out = data / "h264" / f"{loops}" / folder.name
+def h264(data: Path, seconds: int = 10) -> Path:
+    """The simulated flight of some seconds in H.264, as most cameras write it, made by FFmpeg."""
+    out = data / "h264" / f"{seconds}" / "S02_D4_A"
     if out.exists():
         return out
+    if seconds == 10:
+        folder = simulated("S02_D4_A", data, 0)
+    elif not (folder := data / f"{seconds}s" / "Simulated_Data" / "S02_D4_A").exists():
+        recipe = scenario("S02_D4_A")
+        limits = msgspec.structs.replace(recipe.limits, min_distance_m=0.4)
+        recipe = msgspec.structs.replace(recipe, num_frames=round(seconds * recipe.fps), limits=limits)
+        settings = SimulationSettings(masks=False, onboard=False)
+        simulate(recipe, folder.parents[1], settings, report=progress_bar)
     part = out.with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     shutil.copy(folder / "cameras_calibration.csv", part)
     for video in sorted(folder.glob("cam*.avi")):
         print(f"encoding {out / video.stem}.mp4", flush=True)
-        there, back, listed = (part / name for name in ("there.mp4", "back.mp4", "list.txt"))
-        _ffmpeg("-i", video, "-c:v", "libx264", there)
-        if loops > 1:
-            _ffmpeg("-i", video, "-vf", "reverse", "-c:v", "libx264", back)
-        played = [(there, back)[number % 2] for number in range(loops)]
-        listed.write_text("".join(f"file {each.name}\n" for each in played), encoding="utf-8")
-        _ffmpeg("-f", "concat", "-i", listed, "-c", "copy", part / f"{video.stem}.mp4")
-    for each in (there, back, listed):
-        each.unlink(missing_ok=True)
+        if shutil.which("ffmpeg") is None:
+            sys.exit("benchmark: expected FFmpeg, which encodes videos, found none; or pass --sequence")
+        encode = "ffmpeg", "-v", "error", "-y", "-i", video, "-c:v", "libx264", part / f"{video.stem}.mp4"
+        subprocess.run(list(map(str, encode)), check=True)
     return part.rename(out)
 
 
-def _ffmpeg(*words: object) -> None:
-    if shutil.which("ffmpeg") is None:
-        sys.exit(
-            "benchmark: expected FFmpeg, which makes the videos, found none; or name a recording by --sequence"
-        )
-    subprocess.run(["ffmpeg", "-v", "error", "-y", *map(str, words)], check=True)
-
-
-def live(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def live(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Delay from the last camera's frame to the row."""
-    rows = []
-    folder = folder if options.sequence else h264(folder, options.data, 1)
+    rows, folder = [], options.sequence or h264(options.data)
     fps = open_recording(folder).fps
     seconds = () if options.frames is None else ("--seconds", f"{options.frames / fps}")
     with tempfile.TemporaryDirectory() as cache:
@@ -192,7 +188,7 @@ def live(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]
     return rows, {}
 
 
-def batch(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def batch(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Seconds of some runs at once, and of one run."""
     from psotrack.foreground.silhouettes import compute
     from psotrack.pipeline import track_runs
@@ -201,7 +197,8 @@ def batch(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any
 
     if options.device:
         use_device(options.device)
-    recording = open_recording(folder).usable(num_frames=options.frames)
+    sequence = options.sequence or simulated("S02_D4_A", options.data, 0)
+    recording = open_recording(sequence).usable(num_frames=options.frames)
     silhouettes = compute(recording, TrackSettings().silhouettes, cache=options.data / "silhouettes")
     seconds: dict[int, dict[str, float]] = {}
     for runs in (1, options.runs):
@@ -246,14 +243,6 @@ def _record_of(words: tuple[object, ...], cache: Path) -> tuple[dict[str, Any], 
         if program.returncode:
             sys.exit(program.returncode)
         return json.loads(tracks.with_suffix(".json").read_text(encoding="utf-8")), peak / 1e6
-
-
-def _codec(video: VideoInfo) -> str:
-    """Name of a video's codec, four letters."""
-    capture = cv2.VideoCapture(str(video.path.resolve()), cv2.CAP_FFMPEG)
-    code = int(capture.get(cv2.CAP_PROP_FOURCC))
-    capture.release()
-    return np.array([code], "<u4").tobytes().decode(errors="replace")
 
 
 if __name__ == "__main__":
