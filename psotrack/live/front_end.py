@@ -28,6 +28,7 @@ from psotrack.foreground.silhouettes import (
 from psotrack.live.meeting import STOPPED_S, Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import ANSWER_S, LiveCamera, SourceFrame
+from psotrack.support import processors
 
 logger = logging.getLogger(__name__)
 
@@ -64,6 +65,8 @@ class FrontEnd:
         self._cameras, self._settings, self._meeting = cameras, settings, meeting
         self._changed = threading.Condition()
         self._ready = threading.Semaphore(0)
+        # More threads than processors at once would only take Python's lock from each other.
+        self._turns = threading.Semaphore(processors())
         # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
         self._is_stopped = False
         self._said = [""] * len(cameras)
@@ -179,8 +182,9 @@ class FrontEnd:
             again = " again" if meeting.cameras[index].has_filmed else ""
             if meeting.announce(index, time_s, time.monotonic()):
                 logger.warning("camera %s films%s", camera.name, again)
-        is_late = time.monotonic() - frame.arrived_s > meeting.wait_s
-        image = silhouettes.look(None if is_late else frame.image)
+        with self._turns:
+            is_late = time.monotonic() - frame.arrived_s > meeting.wait_s
+            image = silhouettes.look(None if is_late else frame.image)
         if image is not None:
             self._shown_s[index] = time_s
         is_unseen = not is_late and time_s - self._shown_s[index] > STOPPED_S
@@ -192,7 +196,8 @@ class FrontEnd:
                 # Silhouettes of other cameras come first, which the tracker waits for.
                 self._changed.wait_for(lambda: not meeting.has_work, _LONGEST_TURN_S)
         if not is_late:
-            silhouettes.learn()
+            with self._turns:
+                silhouettes.learn()
         if camera.recorder is not None:
             camera.recorder.write(frame.image, frame.time_s)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -26,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 #: How long an instant waits for cameras, and a frame for the processor, seconds.
 WAIT_S = 0.1
+#: Time after which a thread hands on Python's lock, seconds.
+_SWITCH_S = 0.0005
 
 
 #: Takes the rows of each instant: writes them to a file or a stream, or sends them.
@@ -137,6 +140,9 @@ class LiveSession:
         # What was made so far is not searched for garbage again and again, which takes as long as a frame.
         gc.collect()
         gc.freeze()
+        # A camera's thread, and this one, wait for Python's lock no longer than a small part of a frame.
+        switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
         try:
             with contextlib.closing(front_end.instants(longest_s)) as instants:
                 for instant in instants:
@@ -147,6 +153,7 @@ class LiveSession:
                         on_instant(result)
                     self._tracker.look_ahead()
         finally:
+            sys.setswitchinterval(switch_s)
             gc.unfreeze()
         self._check()
         return result

@@ -53,8 +53,6 @@ _FOREGROUND = 255
 _VAR_THRESHOLD = 12.0
 #: MOG2's variance of a new colour, and its least variance, squared grey levels: OpenCV's own.
 _NEW_VARIANCE, _LEAST_VARIANCE = 15.0, 4.0
-#: Number of tiles along each side of an image.
-_TILES = 6
 #: Learning rate per frame. MOG2 takes a new colour for background at a weight of 0.1, which is after 6 frames.
 _LEARNING_RATE = 0.02
 #: Number of first frames of a file that are seen twice, 2 s of most videos.
@@ -173,7 +171,7 @@ class _Look(NamedTuple):
 
 
 class _Mog2:
-    """OpenCV's MOG2, one for each tile of an image: a tile without a pixel that is asked about takes no time.
+    """OpenCV's MOG2, which is asked about, and learns, some pixels of an image.
 
     Args:
         image: (height, width, 3), the background.
@@ -182,22 +180,16 @@ class _Mog2:
 
     def __init__(self, image: _Image, variance: float = _NEW_VARIANCE) -> None:
         self.variance = max(_LEAST_VARIANCE, variance)
-        tiles = itertools.product(*map(_parts, image.shape[:2]))
-        self._tiles = [(tile, self._begun(image[tile])) for tile in tiles]
-
-    def _begun(self, image: _Image) -> cv2.BackgroundSubtractorMOG2:
-        model = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
-        model.setShadowThreshold(_SHADOW_BRIGHTNESS)
-        model.setVarInit(self.variance)
-        model.apply(image, learningRate=1)
-        return model
+        self._model = cv2.createBackgroundSubtractorMOG2(varThreshold=_VAR_THRESHOLD, detectShadows=True)
+        self._model.setShadowThreshold(_SHADOW_BRIGHTNESS)
+        self._model.setVarInit(self.variance)
+        self._model.apply(image, learningRate=1)
 
     def labels(self, image: _Image, chosen: _Mask, learning_rate: float = 0.0) -> _Mask:
         """(height, width), MOG2's labels of the chosen pixels, which it also learns; 0 elsewhere."""
-        labels, others = np.zeros_like(chosen), cv2.bitwise_not(chosen)
-        for tile, model in self._tiles:
-            if cv2.hasNonZero(chosen[tile]):
-                model.apply(image[tile], others[tile], labels[tile], learning_rate)
+        if not cv2.hasNonZero(chosen):
+            return np.zeros_like(chosen)
+        labels = self._model.apply(image, cv2.bitwise_not(chosen), None, learning_rate)
         return np.asarray(cv2.bitwise_and(labels, chosen))
 
 
@@ -427,12 +419,6 @@ def _placed(part: _Mask, near: tuple[slice, slice], shape: tuple[int, ...]) -> _
     mask = np.zeros(shape, np.uint8)
     mask[near] = part
     return mask
-
-
-def _parts(side: int) -> list[slice]:
-    """The pixels along a side of an image, in as many parts as it has tiles."""
-    step = math.ceil(side / _TILES)
-    return [slice(start, start + step) for start in range(0, side, step)]
 
 
 def _white(chosen: np.ndarray) -> _Mask:
