@@ -19,7 +19,7 @@ from psotrack.foreground.silhouettes.settings import ForegroundSettings
 from psotrack.recordings import VideoInfo, read_near
 
 #: Memory for the frames that are held, bytes: 10 s of a video of 1920 x 1080 pixels, reduced by 4.
-_HELD_BYTES = 128 * 2**20
+_HELD_BYTES = 96 * 2**20
 #: Frames that are looked at in the rest of the video: one of 200, and at least 4, which is enough to tell what
 #: stays at its place from what flies on.
 _LATER_SHARE, _LEAST_LATER = 200, 4

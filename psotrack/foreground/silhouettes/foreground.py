@@ -2,8 +2,8 @@
 
 Method: Zivkovic, "Improved adaptive Gaussian mixture model for background subtraction", ICPR 2004; Zivkovic
 and van der Heijden, "Efficient adaptive density estimation per image pixel", 2006; OpenCV's implementation.
-A first pass over frames from the whole video learns the background, each frame with equal weight. So the foreground of
-the second pass is usable from frame 0, and a drone that stands at one place for less than half of the video does not
+The background is learned from some frames of the whole video, before the foreground of the first one is asked for. So
+the foreground is usable from frame 0, and a drone that stands at one place for less than half of the video does not
 become background.
 
 No step shifts the mask: images are reduced by whole factors, by area, and speckle is removed blob by blob.
