@@ -113,9 +113,10 @@ def probe(path: Path | str) -> VideoInfo:
     if not first_s:
         raise _undecodable(path, len(times_s), codec)
     is_finished = stated >= 1
-    is_timed = len(first_s) <= len(times_s) and np.allclose(
-        first_s, times_s[: len(first_s)], rtol=0, atol=_SAME_S
-    )
+    # The first frame is that of the first packet, and each of the others that of a later one.
+    apart_s = np.abs(np.subtract.outer(first_s, times_s))
+    packet = apart_s.argmin(axis=1)
+    is_timed = bool(packet[0] == 0 and (np.diff(packet) > 0).all() and (apart_s.min(axis=1) <= _SAME_S).all())
     if not is_finished:
         times_s = times_s[:-1]
     elif not is_timed:

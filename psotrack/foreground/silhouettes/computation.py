@@ -320,7 +320,7 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
         with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
             taken = map_in_processes(store, missing, jobs=jobs, advance=advance)
     seconds = {stage: sum((each[stage] for each in taken), 0.0) for stage in ("decode", "foreground")}
-    return {**seconds, "silhouettes": time.perf_counter() - began}
+    return {**seconds, "silhouettes": time.perf_counter() - began if missing else 0.0}
 
 
 def _left_out(name: str, array: zarr.Array, times: FrameTimes, *, with_future: bool) -> list[Interval]:

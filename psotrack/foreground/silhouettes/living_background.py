@@ -112,7 +112,7 @@ class Living:
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
         used = ("working_reduction", "num_learning_frames", "min_blob_px", "soft_edges", "first_look")
-        return {"living": 4, **{name: getattr(self.settings, name) for name in used}}
+        return {"living": 3, **{name: getattr(self.settings, name) for name in used}}
 
     def foreground(
         self,
