@@ -134,7 +134,7 @@ def test_the_contract_from_videos_to_errors(run, data, tmp_path):
     # All of the program's time counts, and less of it without the start and the compilation.
     total_s = NUM_FRAMES / 25 / record["real_time_factor"]
     assert total_s == pytest.approx(record["seconds"]["total"], rel=0.02)
-    assert record["real_time_factor_running"] > record["real_time_factor"] > 0
+    assert record["real_time_factor_running"] >= record["real_time_factor"] > 0
     assert set(record["input_keys"]) == set(CAMERAS)
     assert {"python", "jax", "numpy", "psotrack"} <= set(record["versions"])
     assert record["device"]["platform"]
