@@ -14,12 +14,11 @@ KNOCKED, SHIFT_PX = 80, (3, 4)
 
 @pytest.mark.slow
 def test_a_camera_whose_video_moves_is_left_out_once(tmp_path, caplog):
-    settings = SimulationSettings(scale=0.25, num_frames=160, masks=False, onboard=False)
-    folder = simulate("S02_D4_A", tmp_path, settings)
+    small = SimulationSettings(scale=0.25, num_frames=160, masks=False, onboard=False)
+    folder = simulate("S02_D4_A", tmp_path, small)
     video = open_recording(folder).videos["cam3"]
-    frames = [frame.copy() for frame in read_frames(video)]
     with VideoWriter(video.path, video.fps, video.image_size_wh) as moved:
-        for number, frame in enumerate(frames):
+        for number, frame in enumerate(list(read_frames(video))):
             moved.write(np.roll(frame, SHIFT_PX, axis=(0, 1)) if number >= KNOCKED else frame)
     recording = open_recording(folder).usable()
     tracked = track_recording(recording, cache=tmp_path / "cache")

@@ -395,8 +395,7 @@ WHERE = Path("R01_D2.c3d")
 
 
 @pytest.mark.parametrize(
-    ("gap", "status"),
-    [(1, Status.COASTING), (20, Status.COASTING), (50, Status.COASTING), (51, Status.LOST)],
+    ("gap", "status"), [(1, Status.COASTING), (20, Status.COASTING), (50, Status.COASTING), (51, Status.LOST)]
 )
 def test_gaps_are_bridged_to_half_a_second(gap, status):
     markers_m = record_markers(FOUR_M, 300)

@@ -14,9 +14,7 @@ from psotrack.recordings import FrameTimes, make_timeline
 
 # The strategies draw plain numbers: the runtime type checks draw random numbers of their own, which hypothesis forbids.
 regular = st.tuples(
-    st.integers(1, 40),
-    st.sampled_from([12.5, 24.0, 25.0, 29.97, 30.0, 50.0, 100.0]),
-    st.floats(-0.3, 0.5),
+    st.integers(1, 40), st.sampled_from([12.5, 24.0, 25.0, 29.97, 30.0, 50.0, 100.0]), st.floats(-0.3, 0.5)
 )
 steps = st.lists(st.floats(0.005, 0.2), min_size=1, max_size=30)
 one_camera = regular | steps
