@@ -314,7 +314,8 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
     of the whole."""
     # Two cameras with the same content have the same key, so their silhouettes are made once.
     missing = list({task.stored.path: task for task in tasks}.values())
-    taken, began = list[dict[str, float]](), time.perf_counter()
+    taken: list[dict[str, float]] = []
+    began = time.perf_counter()
     if missing:
         logger.info("silhouettes: computing those of %d videos", len(missing))
         with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:

@@ -42,8 +42,8 @@ _SHARP_DIFFERENCE = 40.0
 #: Edges of an object at its contour, relative to the background's edges at the same place, and above them.
 _OWN_EDGES, _LEAST_EDGE = 1.3, 2.0
 _AROUND = np.ones((3, 3), np.uint8)
-#: What is an object depends on so many pixels beside it: MOG2's foreground may touch it (2), and a gradient at its
-#: contour has pixels beyond (2).
+#: Number of pixels about a blob that decide whether the blob is an object: foreground of MOG2 within 2 pixels touches
+#: the blob, and the gradient at its contour uses 2 pixels beyond.
 _MARGIN = 4
 
 _Mask = UInt8[np.ndarray, "height width"]
