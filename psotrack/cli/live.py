@@ -109,6 +109,7 @@ def live(
         output.refuse(out, out.with_suffix(".json"))
     if view is not None:
         _check_viewer(view)
+    support.start_server("psotrack.live.front_end")
     tracking = TrackSettings().changed(settings)
     support.keep_compiled(compiled_folder(cache))
     start_s = output.elapsed_s

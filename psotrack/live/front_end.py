@@ -1,7 +1,6 @@
-"""The front end of a session: a thread for each camera turns frames into silhouettes, which meet at instants.
+"""The front end of a session: a process for each camera turns frames into silhouettes, which meet at instants.
 
-OpenCV does not hold Python's lock while it works, so the threads use all processors. What they share is changed under
-one lock.
+Threads would wait for Python's lock, which the tracker needs, too.
 """
 
 from __future__ import annotations
@@ -9,15 +8,24 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import logging.handlers
+import math
+import os
+import queue
 import threading
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, MutableSequence, Sequence
+from dataclasses import replace
 from functools import partial
+from multiprocessing.connection import Connection, wait
+from multiprocessing.sharedctypes import RawArray
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from psotrack.errors import PsotrackError
 from psotrack.foreground.silhouettes import (
     ForegroundSettings,
     LivingBackground,
@@ -28,29 +36,79 @@ from psotrack.foreground.silhouettes import (
 from psotrack.live.meeting import STOPPED_S, Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import ANSWER_S, LiveCamera, SourceFrame
-from psotrack.support import processors
+from psotrack.support import with_traceback, workers
 
 logger = logging.getLogger(__name__)
 
 #: Largest number of complete instants that wait for the tracker: more are left out, so that the delay does not grow.
 _MOST_WAITING = 3
-#: Longest time that a camera waits for the silhouettes of others before it learns, seconds.
-_LONGEST_TURN_S = 0.02
+#: Longest time that a camera waits for the silhouettes of others before it learns, and how often it looks, seconds.
+_LONGEST_TURN_S, _TURN_S = 0.02, 0.001
 #: Longest time for which the session waits for frames before it looks what is to be done without them, seconds.
 _LOOK_S = 0.005
 #: What is said of a camera whose images have not shown its scene for as long as one that has stopped.
 _UNSEEN = "its images do not show the scene: too dark, too bright, of one colour, or another picture"
 #: Time from the start of the sources to the recording's time 0, seconds.
 _LEAD_S = 0.2
-#: Longest time that the threads have to end, seconds: OpenCV waits 10 s for a device that does not answer.
+#: How often the thread that listens to the cameras looks whether the session is over, seconds.
+_LISTEN_S = 0.1
+#: Longest time that the cameras have to end, seconds: OpenCV waits 10 s for a device that does not answer.
 _END_S = 10.0 + ANSWER_S + CLOSE_S
+#: A camera is behind from this share of the longest wait on, and learns one of so many frames only.
+_BEHIND, _LEARN_EVERY = 0.5, 3
+#: Lower priority of the processes of cameras, as `nice` counts it: an instant that is complete comes first.
+_NICE = 5
+
+
+class _Ready(NamedTuple):
+    """A source is open."""
+
+
+class _Came(NamedTuple):
+    """A frame has come, and is in work."""
+
+    time_s: float
+
+
+class _Shown(NamedTuple):
+    """What a frame showed: see `Meeting.put`."""
+
+    time_s: float
+    coverage: UInt8[np.ndarray, "height width"] | None
+    arrived_s: float
+
+
+class _Said(NamedTuple):
+    """What is to be said of a camera, once; an empty line: nothing."""
+
+    line: str
+
+
+class _Ended(NamedTuple):
+    """A camera has ended: its error, and what was recorded."""
+
+    error: Exception | None
+    recorded: RecordedCounts | None
+
+
+class _Shared(NamedTuple):
+    """Memory that all processes of a session share.
+
+    Attributes:
+        is_stopped: one number, not 0 after the session was stopped. No `threading.Event`: a signal handler that
+            interrupts `set` and calls it again would wait for ever.
+        in_work_s: (cameras,), time of the frame in each camera's hands; infinite for no frame.
+    """
+
+    is_stopped: MutableSequence[int]
+    in_work_s: MutableSequence[float]
 
 
 class FrontEnd:
     """Cameras that film, and the instants that they show.
 
     Args:
-        cameras: the cameras.
+        cameras: the cameras; they are picklable, as processes of their own film.
         settings: settings of the silhouettes.
         meeting: brings their frames together. A frame that has waited for longer than an instant does is left out, so
             that the delay does not grow.
@@ -65,12 +123,8 @@ class FrontEnd:
         self._cameras, self._settings, self._meeting = cameras, settings, meeting
         self._changed = threading.Condition()
         self._ready = threading.Semaphore(0)
-        # More threads than processors at once would only take Python's lock from each other.
-        self._turns = threading.Semaphore(processors())
-        # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
-        self._is_stopped = False
+        self._shared = _Shared(RawArray("b", 1), RawArray("d", [math.inf] * len(cameras)))
         self._said = [""] * len(cameras)
-        self._shown_s = [np.inf] * len(cameras)
         self.num_left_out = 0
         self.errors: dict[int, Exception] = {}
         self.recorded: dict[str, RecordedCounts] = {}
@@ -84,7 +138,7 @@ class FrontEnd:
 
     def stop(self) -> None:
         """Let the cameras end; from any thread or signal handler."""
-        self._is_stopped = True
+        self._shared.is_stopped[0] = 1
 
     def instants(self, longest_s: float) -> Generator[Instant]:
         """Let the cameras film, and yield the instants that are complete; to be closed, which ends the cameras.
@@ -92,32 +146,32 @@ class FrontEnd:
         Args:
             longest_s: time after which there are no more instants, seconds.
         """
-        num_opencv_threads = cv2.getNumThreads()
-        # As many threads as cameras: more for each of them would only wait.
-        cv2.setNumThreads(1)
-        threads = [
-            threading.Thread(target=self._film, args=each, daemon=True) for each in enumerate(self._cameras)
+        wait_s = self._meeting.wait_s
+        each = [
+            (camera, index, self._settings, wait_s, self._shared)
+            for index, camera in enumerate(self._cameras)
         ]
-        for thread in threads:
-            thread.start()
-        try:
-            for _ in threads:
-                self._ready.acquire()
-            with self._changed:
-                self._meeting.began_s = time.monotonic() + _LEAD_S
-                self._changed.notify_all()
-            yield from self._complete(self._meeting.began_s + longest_s)
-        finally:
-            self.stop()
-            with self._changed:
-                self._changed.notify_all()
-            ends_s = time.monotonic() + _END_S
-            for thread in threads:
-                thread.join(max(0.0, ends_s - time.monotonic()))
-            cv2.setNumThreads(num_opencv_threads)
+        with workers(_film, each) as connections:
+            is_over = threading.Event()
+            listener = threading.Thread(target=self._listen, args=(connections, is_over), daemon=True)
+            listener.start()
+            try:
+                for _ in connections:
+                    self._ready.acquire()
+                with self._changed:
+                    self._meeting.began_s = time.monotonic() + _LEAD_S
+                for connection in connections:
+                    with contextlib.suppress(OSError):  # of a camera that has ended
+                        connection.send(self._meeting.began_s)
+                yield from self._complete(self._meeting.began_s + longest_s)
+            finally:
+                self.stop()
+                listener.join(_END_S)
+                is_over.set()
+                listener.join()
 
     def _complete(self, ends_s: float) -> Iterator[Instant]:
-        while not self._is_stopped and self.num_able >= 2 and time.monotonic() < ends_s:
+        while not self._shared.is_stopped[0] and self.num_able >= 2 and time.monotonic() < ends_s:
             with self._changed:
                 now_s = time.monotonic()
                 self._tell_stopped(now_s)
@@ -137,69 +191,169 @@ class FrontEnd:
             elif not self._said[index]:  # else it is said already why
                 logger.warning("camera %s: no frame came so far", name)
 
-    # The thread of a camera
+    # The thread that listens to the cameras
 
-    def _film(self, index: int, camera: LiveCamera) -> None:
-        """Frames to silhouettes."""
-        silhouettes = CameraSilhouettes(self._settings, camera)
-        try:
-            with contextlib.closing(camera.source.frames(self._begin, lambda: self._is_stopped)) as frames:
-                for frame in itertools.takewhile(lambda _: not self._is_stopped, frames):
-                    if isinstance(frame, str):
-                        self._say(index, frame)
-                    else:
-                        self._take(index, frame, silhouettes)
-        except Exception as error:
-            logger.warning("camera %s: %s", camera.name, error)
-            self.errors[index] = error
-        finally:
-            self._ready.release()  # where it ended before it was ready
-            with self._changed:
-                self._meeting.end(index)
-                self._changed.notify_all()
-            if camera.recorder is not None:
-                self.recorded[camera.name] = camera.recorder.close()
+    def _listen(self, connections: list[Connection], is_over: threading.Event) -> None:
+        """Take what the cameras send, until all have ended."""
+        filming: dict[Connection, int] = {connection: index for index, connection in enumerate(connections)}
+        while filming and not is_over.is_set():
+            for ready in wait(list(filming), _LISTEN_S):
+                assert isinstance(ready, Connection)
+                try:
+                    message = ready.recv()
+                except (EOFError, OSError):
+                    expected, found = "frames", "that the camera's process died"
+                    remedy = (
+                        "is memory short? is the call in a script outside of `if __name__ == '__main__':`?"
+                    )
+                    name = self._cameras[filming[ready]].name
+                    message = _Ended(PsotrackError(name, expected=expected, found=found, remedy=remedy), None)
+                with self._changed:
+                    self._hear(filming[ready], message)
+                    self._changed.notify_all()
+                if isinstance(message, _Ended):
+                    del filming[ready]
 
-    def _begin(self) -> float:
-        """Wait until all sources are ready."""
-        self._ready.release()
-        with self._changed:
-            self._changed.wait_for(lambda: self._meeting.began_s < np.inf or self._is_stopped)
-        return self._meeting.began_s
+    def _hear(self, index: int, message: object) -> None:
+        name, meeting = self._cameras[index].name, self._meeting
+        match message:
+            case _Came(time_s):
+                again = " again" if meeting.cameras[index].has_filmed else ""
+                if meeting.announce(index, time_s, time.monotonic()):
+                    logger.warning("camera %s films%s", name, again)
+            case _Shown(time_s, image, arrived_s):
+                meeting.put(index, time_s, image, arrived_s)
+            case _Said(line):
+                if line and line != self._said[index]:
+                    logger.warning("camera %s: %s", name, line)
+                self._said[index] = line
+            case logging.LogRecord():
+                logging.getLogger(message.name).handle(message)
+            case _Ready():
+                self._ready.release()
+            case _Ended(error, recorded):
+                if error is not None:
+                    logger.warning("camera %s: %s", name, error)
+                    self.errors[index] = error
+                if recorded is not None:
+                    self.recorded[name] = recorded
+                meeting.end(index)
+                self._ready.release()  # where it ended before it was ready
 
-    def _say(self, index: int, line: str) -> None:
-        with self._changed:
-            if line and line != self._said[index]:
-                logger.warning("camera %s: %s", self._cameras[index].name, line)
-            self._said[index] = line
 
-    def _take(self, index: int, frame: SourceFrame, silhouettes: CameraSilhouettes) -> None:
+def _film(
+    camera: LiveCamera,
+    index: int,
+    settings: ForegroundSettings,
+    wait_s: float,
+    shared: _Shared,
+    connection: Connection,
+) -> None:
+    """In the process of a camera: send what its frames show, until the session is stopped or the source ends."""
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    sending = threading.Lock()  # a recorder warns from a thread of its own
+
+    def send(message: object) -> None:
+        with sending:
+            connection.send(message)
+
+    def begin() -> float:
+        send(_Ready())
+        began_s: float = connection.recv()
+        return began_s
+
+    def is_stopped() -> bool:
+        return bool(shared.is_stopped[0])
+
+    root = logging.getLogger("psotrack")
+    root.addHandler(_Sent(send))
+    root.setLevel(logging.INFO)
+    _rehearse(settings, camera)
+    filming, error, recorded = _Filming(camera, index, settings, wait_s, shared, send), None, None
+    try:
+        with contextlib.closing(camera.source.frames(begin, is_stopped)) as frames:
+            for frame in itertools.takewhile(lambda _: not is_stopped(), frames):
+                if isinstance(frame, str):
+                    send(_Said(frame))
+                else:
+                    filming.take(frame)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        raise
+    except Exception as found:
+        error = with_traceback(found)
+    finally:
+        shared.in_work_s[index] = math.inf
+        if camera.recorder is not None:
+            recorded = camera.recorder.close()
+    send(_Ended(error, recorded))
+
+
+def _rehearse(settings: ForegroundSettings, camera: LiveCamera) -> None:
+    """Make silhouettes of noise: the first ones take many times as long as others."""
+    silhouettes = CameraSilhouettes(settings, replace(camera, ignore=None))
+    for small in np.random.default_rng(0).integers(0, 256, (3, 27, 48, 3), np.uint8):
+        silhouettes.look(cv2.resize(small, (1920, 1080)))
+        silhouettes.learn()
+
+
+class _Sent(logging.handlers.QueueHandler):
+    """Sends what is logged to the parent process, which knows what is to be told."""
+
+    def __init__(self, send: Callable[[object], None]) -> None:
+        super().__init__(queue.SimpleQueue())
+        self._send = send
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        self._send(record)
+
+
+class _Filming:
+    """The frames of one camera, in its process."""
+
+    def __init__(
+        self,
+        camera: LiveCamera,
+        index: int,
+        settings: ForegroundSettings,
+        wait_s: float,
+        shared: _Shared,
+        send: Callable[[object], None],
+    ) -> None:
+        self._camera, self._index, self._wait_s, self._shared = camera, index, wait_s, shared
+        self._send = send
+        self._silhouettes = CameraSilhouettes(settings, camera)
+        self._shown_s, self._num_unlearned = math.inf, 0
+
+    def take(self, frame: SourceFrame) -> None:
         """A frame: what the tracker waits for comes first."""
-        camera, meeting = self._cameras[index], self._meeting
+        camera, in_work_s = self._camera, self._shared.in_work_s
         # That of the middle row of a rolling shutter, as in a recording.
         time_s = frame.time_s + camera.line_time_s * frame.image.shape[0] / 2
-        with self._changed:
-            again = " again" if meeting.cameras[index].has_filmed else ""
-            if meeting.announce(index, time_s, time.monotonic()):
-                logger.warning("camera %s films%s", camera.name, again)
-        with self._turns:
-            is_late = time.monotonic() - frame.arrived_s > meeting.wait_s
-            image = silhouettes.look(None if is_late else frame.image)
+        in_work_s[self._index] = time_s
+        self._send(_Came(time_s))
+        is_late = time.monotonic() - frame.arrived_s > self._wait_s
+        image = self._silhouettes.look(None if is_late else frame.image)
         if image is not None:
-            self._shown_s[index] = time_s
-        is_unseen = not is_late and time_s - self._shown_s[index] > STOPPED_S
-        self._say(index, _UNSEEN if is_unseen else "")
-        with self._changed:
-            meeting.put(index, time_s, image, frame.arrived_s)
-            self._changed.notify_all()
-            if not is_late:
-                # Silhouettes of other cameras come first, which the tracker waits for.
-                self._changed.wait_for(lambda: not meeting.has_work, _LONGEST_TURN_S)
-        if not is_late:
-            with self._turns:
-                silhouettes.learn()
+            self._shown_s = time_s
+        self._send(_Shown(time_s, image, frame.arrived_s))
+        in_work_s[self._index] = math.inf
+        is_unseen = not is_late and time_s - self._shown_s > STOPPED_S
+        self._send(_Said(_UNSEEN if is_unseen else ""))
+        self._num_unlearned += 1
+        is_behind = time.monotonic() - frame.arrived_s > _BEHIND * self._wait_s
+        if not is_late and (not is_behind or self._num_unlearned >= _LEARN_EVERY):
+            self._wait_for_others(time_s)
+            self._silhouettes.learn()
+            self._num_unlearned = 0
         if camera.recorder is not None:
             camera.recorder.write(frame.image, frame.time_s)
+
+    def _wait_for_others(self, time_s: float) -> None:
+        """Let the others make the silhouettes of an instant, which the tracker waits for."""
+        ends_s = time.monotonic() + _LONGEST_TURN_S
+        while min(self._shared.in_work_s) <= time_s and time.monotonic() < ends_s:
+            time.sleep(_TURN_S)
 
 
 class CameraSilhouettes:

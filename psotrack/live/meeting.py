@@ -133,11 +133,6 @@ class Meeting:
         self._rate_hz, self._first_s = rate_hz, first_s
         self._next = 0
 
-    @property
-    def has_work(self) -> bool:
-        """Whether a frame of a camera is in work."""
-        return any(camera.in_work_s is not None for camera in self.cameras)
-
     def announce(self, index: int, time_s: float, now_s: float) -> bool:
         """A frame of a camera has come, and is in work: its instant waits for `put`.
 

@@ -87,7 +87,6 @@ class CameraRecorder:
         self.video, self.times = (folder / file for file in _files_of(name))
         self._num_frames, self._num_taken, self._last_s = 0, 0, -np.inf
         self._is_late = self._has_failed = False
-        self._waiting: queue.SimpleQueue[tuple[np.ndarray, float] | None] = queue.SimpleQueue()
 
     def write(self, image: UInt8[np.ndarray, "height width 3"], time_s: float) -> None:
         """Hand over the next frame; does not wait. Where the recording leaves out frames or ends, a line says so, once.
@@ -100,6 +99,8 @@ class CameraRecorder:
             return
         self._last_s = time_s
         if not self._num_frames:
+            # Not before: a recorder is sent to the process of its camera.
+            self._waiting: queue.SimpleQueue[tuple[np.ndarray, float] | None] = queue.SimpleQueue()
             self._thread = threading.Thread(target=self._encode, args=image.shape[1::-1], daemon=True)
             self._thread.start()
         self._num_frames += 1

@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 #: How long an instant waits for cameras, and a frame for the processor, seconds.
 WAIT_S = 0.1
+#: A session is behind from this share of `WAIT_S` on, and searches for drones in one of so many instants only.
+_BEHIND, _SEARCHES_EVERY = 0.5, 3
 #: Time after which a thread hands on Python's lock, seconds.
 _SWITCH_S = 0.0005
 
@@ -151,7 +153,10 @@ class LiveSession:
                     result.seconds = time.monotonic() - self._meeting.began_s
                     if on_instant is not None:
                         on_instant(result)
-                    self._tracker.look_ahead()
+                    # A search takes longer than a step: it must not be the reason why frames are left out.
+                    is_behind = result.delay_s[-1] > _BEHIND * self._meeting.wait_s
+                    if not is_behind or result.instants % _SEARCHES_EVERY == 0:
+                        self._tracker.look_ahead()
         finally:
             sys.setswitchinterval(switch_s)
             gc.unfreeze()

@@ -51,7 +51,7 @@ from .plugins import (
     plugin_source,
     register_plugin,
 )
-from .processes import map_in_processes, start_server
+from .processes import map_in_processes, start_server, with_traceback, workers
 from .progress import (
     Advance,
     Report,
@@ -190,6 +190,8 @@ __all__ = [
     "user_cache",
     "whole_number",
     "widening",
+    "with_traceback",
+    "workers",
     "write_json",
     "write_rows",
     "write_toml",

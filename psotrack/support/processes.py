@@ -12,6 +12,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any, NoReturn, TypeVar
@@ -67,20 +68,9 @@ def map_in_processes(
     """
     if jobs == 1 or len(tasks) < 2:
         return [function(task, advance) for task in tasks]
-    start_server(function.__module__)
-    context = _context()
-    connections: list[Connection] = []
-    processes = []
     waiting = deque(enumerate(tasks))
     results: dict[int, _Result] = {}
-    try:
-        with _start_of_workers():
-            for _ in range(min(jobs, len(tasks))):
-                here, there = context.Pipe()
-                processes.append(context.Process(target=_serve, args=(function, there), daemon=True))
-                processes[-1].start()
-                there.close()
-                connections.append(here)
+    with workers(partial(_serve, function), [()] * min(jobs, len(tasks))) as connections:
         for connection in connections:
             connection.send(waiting.popleft())
         while len(results) < len(tasks):
@@ -95,6 +85,35 @@ def map_in_processes(
                     index, results[index] = message
                     if waiting:
                         ready.send(waiting.popleft())
+    return [results[index] for index in range(len(tasks))]
+
+
+@contextlib.contextmanager
+def workers(
+    function: Callable[..., object], arguments: Sequence[tuple[Any, ...]]
+) -> Iterator[list[Connection]]:
+    """Processes that each call `function(*arguments, connection)`, and end with this block, or with this process.
+
+    Args:
+        function: importable by name, or a part of such a function; ends when the pipe to this process breaks.
+        arguments: picklable arguments of each process.
+
+    Yields:
+        This process's ends of the pipes.
+    """
+    start_server(getattr(function, "func", function).__module__)
+    context = _context()
+    connections: list[Connection] = []
+    processes = []
+    try:
+        with _start_of_workers():
+            for each in arguments:
+                here, there = context.Pipe()
+                processes.append(context.Process(target=_work, args=(function, *each, there), daemon=True))
+                processes[-1].start()
+                there.close()
+                connections.append(here)
+        yield connections
     finally:
         for connection in connections:
             connection.close()
@@ -106,7 +125,6 @@ def map_in_processes(
                 getattr(process, then)()
         for process in processes:
             process.join()
-    return [results[index] for index in range(len(tasks))]
 
 
 def start_server(module: str) -> None:
@@ -159,10 +177,16 @@ def _receive(connection: Connection) -> Any:
         ) from error
 
 
-def _serve(function: Callable[..., Any], connection: Connection) -> None:
-    """In a worker: receive tasks; send progress (int), results (index, result) and errors, until the pipe breaks."""
+def _work(function: Callable[..., object], *arguments: Any) -> None:
+    """In a worker: the function, until the pipe breaks."""
     cv2.setNumThreads(1)
     signal.signal(signal.SIGTERM, _end_in_silence)
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        function(*arguments)
+
+
+def _serve(function: Callable[..., Any], connection: Connection) -> None:
+    """In a worker: receive tasks; send progress (int), results (index, result) and errors."""
     steps, sent_s = 0, 0.0
 
     def advance(more: int) -> None:
@@ -173,21 +197,24 @@ def _serve(function: Callable[..., Any], connection: Connection) -> None:
             connection.send(steps)
             steps, sent_s = 0, time.monotonic()
 
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            index, task = connection.recv()
-            try:
-                result = function(task, advance)
-                if steps:
-                    connection.send(steps)
-                steps = 0
-            except Exception as error:
-                if not isinstance(error, PsotrackError):
-                    # The pipe would lose the traceback of a bug.
-                    error.add_note(f"in a worker process:\n{''.join(traceback.format_exception(error))}")
-                connection.send(error)
-            else:
-                connection.send((index, result))
+    while True:
+        index, task = connection.recv()
+        try:
+            result = function(task, advance)
+            if steps:
+                connection.send(steps)
+            steps = 0
+        except Exception as error:
+            connection.send(with_traceback(error))
+        else:
+            connection.send((index, result))
+
+
+def with_traceback(error: Exception) -> Exception:
+    """An error for the parent process: the pipe would lose the traceback of a bug."""
+    if not isinstance(error, PsotrackError):
+        error.add_note(f"in a worker process:\n{''.join(traceback.format_exception(error))}")
+    return error
 
 
 def _end_in_silence(number: int, frame: FrameType | None) -> NoReturn:

@@ -10,6 +10,7 @@ import contextlib
 import faulthandler
 import http.server
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -32,6 +33,7 @@ from small_sweeps import wait_until
 from psotrack.geometry.rig_files import write_rig
 from psotrack.live import (
     CameraStream,
+    LiveResult,
     LiveSession,
     SourceFrame,
     UdpLines,
@@ -469,6 +471,24 @@ def test_without_two_cameras_that_film_the_command_ends(
         assert said.count(f"camera {expected}, found") == 1
     # Nothing is in the way of the next attempt, but what cam1 has filmed is kept.
     assert not list(tmp_path.glob("live*"))
+
+
+@pytest.mark.slow
+def test_a_camera_whose_process_dies_is_one_line_and_the_others_go_on(sequence: Path, caplog) -> None:
+    recording = open_recording(sequence)
+    effort = TrackSettings().changed({"swarm.particles": 20, "swarm.iterations": 15})
+    cameras = live_cameras(recording, replay=True, speed=float(SPEED))
+    session = LiveSession(recording, cameras, effort, most_drones=1, wait_s=0.5)
+
+    def kill_one(result: LiveResult) -> None:
+        if result.instants == 5:
+            multiprocessing.active_children()[0].kill()
+
+    result = session.run([lambda rows: None], kill_one)
+    (line,) = (line for line in caplog.messages if "process" in line)
+    assert ": expected frames, found that the camera's process died; is memory short?" in line
+    assert result.instants == NUM_FRAMES
+    assert sorted(state.counts.frames for state in result.cameras.values())[1:] == [NUM_FRAMES] * 3
 
 
 #: Name of the case -> options, and words of the line.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -59,13 +60,18 @@ class StepwiseTracker:
         self._engine = Engine(self._setting)
         self._shape, self._drones = shape, settings.of_run.drones
         self._most = self._drones.count or most_drones
-        self._run = SwarmRun(
+        self._new_run = partial(
+            SwarmRun,
             self._setting,
             RunInputs(bounds_m, settings),
             on_cpu=not self._engine.side_by_side,
             most_drones=self._most,
             memory_frames=max(1, round(REMEMBERED_S * fps)),
         )
+        self._begin()
+
+    def _begin(self) -> None:
+        self._run = self._new_run()
         self._starts: list[Start] = []
         self._was_full = False
         self._latest: tuple[Block, Rows] | None = None
@@ -75,15 +81,18 @@ class StepwiseTracker:
         """Compile the program for all numbers of drones that may come, so that no frame has to wait for it."""
         coverage = np.zeros((1, len(self._setting.rig), *self._shape), np.uint8)
         zero = np.zeros((1, len(self._setting.rig)), np.float32)
-        block = make_block(
-            self._setting, np.zeros(1, int), coverage, Exposures(zero, zero > 0, zero + 1, zero)
-        )
+        exposures = Exposures(zero, zero > 0, zero + 1, zero)
+        block = make_block(self._setting, np.zeros(1, int), coverage, exposures)
         drones = 0
         while drones < self._most:
             self._run.resize(drones + 1)
             drones = len(self._run.drone)
             self._engine.compile(self._run.job(block, []), block)
-        self._run.resize(0)
+        # The first frame takes many times as long as others: it shall be none that is filmed.
+        self._begin()
+        self.step(0, 0.0, coverage[0], exposures[0])
+        self.look_ahead()
+        self._begin()
 
     @as_written()
     def step(
