@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -82,8 +83,8 @@ class BackgroundModel(Protocol):
 
 
 @dataclass(frozen=True)
-class Mog2:
-    """The background model "mog2" (see the module).
+class OwnBackground(ABC):
+    """A background model of the package, which sees reduced frames only.
 
     Attributes:
         settings: settings of the foreground.
@@ -91,23 +92,7 @@ class Mog2:
 
     settings: ForegroundSettings
 
-    @property
-    def key(self) -> Mapping[str, Any]:
-        """See `BackgroundModel`."""
-        return {"version": 2, "mog2": msgspec.to_builtins(self.settings)}
-
-    def foreground(
-        self,
-        learning: Iterable[UInt8[np.ndarray, "height width 3"]],
-        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
-        """See `BackgroundModel`: values between 0 and 255 are weighted shadow."""
-        settings = self.settings
-        return self.masks(
-            ((1.0, reduce_frame(frame, settings)) for frame in learning),
-            (reduce_frame(frame, settings) for frame in frames),
-        )
-
+    @abstractmethod
     def masks(
         self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]
     ) -> Iterator[_Mask | None]:
@@ -117,6 +102,32 @@ class Mog2:
             learning: weights and reduced frames from the whole video.
             frames: all frames in their order, reduced.
         """
+
+    def foreground(
+        self,
+        learning: Iterable[UInt8[np.ndarray, "height width 3"]],
+        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
+        """See `BackgroundModel`."""
+        settings = self.settings
+        return self.masks(
+            ((1.0, reduce_frame(frame, settings)) for frame in learning),
+            (reduce_frame(frame, settings) for frame in frames),
+        )
+
+
+class Mog2(OwnBackground):
+    """The background model "mog2" (see the module); values between 0 and 255 are weighted shadow."""
+
+    @property
+    def key(self) -> Mapping[str, Any]:
+        """See `BackgroundModel`."""
+        return {"version": 2, "mog2": msgspec.to_builtins(self.settings)}
+
+    def masks(
+        self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]
+    ) -> Iterator[_Mask | None]:
+        """See `OwnBackground`."""
         settings = self.settings
         model, levels = learned_mog2(learning, settings), _levels(settings)
         least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)

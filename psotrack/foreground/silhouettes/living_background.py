@@ -22,14 +22,13 @@ import copy
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.foreground.silhouettes.foreground import learned_mog2, reduce_frame
+from psotrack.foreground.silhouettes.foreground import OwnBackground, learned_mog2
 from psotrack.foreground.silhouettes.lighting import (
     LEAST_DIFFERENCE,
     Comparison,
@@ -97,34 +96,14 @@ _Image = UInt8[np.ndarray, "height width 3"]
 _Mask = UInt8[np.ndarray, "height width"]
 
 
-@dataclass(frozen=True)
-class Living:
-    """The background model "living" (see the module).
-
-    Attributes:
-        settings: settings of the foreground; `working_reduction`, `num_learning_frames` and `min_blob_px` are used.
-            Shadows that touch other foreground count as foreground.
-    """
-
-    settings: ForegroundSettings
+class Living(OwnBackground):
+    """The background model "living" (see the module); shadows that touch other foreground count as foreground."""
 
     @property
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
         used = ("working_reduction", "num_learning_frames", "min_blob_px", "soft_edges", "first_look")
         return {"living": 3, **{name: getattr(self.settings, name) for name in used}}
-
-    def foreground(
-        self,
-        learning: Iterable[UInt8[np.ndarray, "height width 3"]],
-        frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    ) -> Iterator[UInt8[np.ndarray, "working_height working_width"] | None]:
-        """See `BackgroundModel`."""
-        settings = self.settings
-        return self.masks(
-            ((1.0, reduce_frame(frame, settings)) for frame in learning),
-            (reduce_frame(frame, settings) for frame in frames),
-        )
 
     def masks_as_they_come(self, frames: Iterable[_Image]) -> Iterator[_Mask | None]:
         """Yield the foreground of each frame, from what was seen before it, as of a live camera.
@@ -140,12 +119,7 @@ class Living:
     def masks(
         self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]
     ) -> Iterator[_Mask | None]:
-        """Yield the foreground of each of `frames`, as `foreground` does.
-
-        Args:
-            learning: weights and reduced frames from the whole video.
-            frames: all frames in their order, reduced.
-        """
+        """See `OwnBackground`."""
         most_frames = np.asarray(learned_mog2(learning, self.settings).getBackgroundImage())
         background = LivingBackground(self.settings, most_frames, self.settings.num_learning_frames)
         coming = iter(frames)

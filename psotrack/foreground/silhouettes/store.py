@@ -27,7 +27,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes.first_look import look_first
 from psotrack.foreground.silhouettes.foreground import (
     BackgroundModel,
-    Mog2,
+    OwnBackground,
     coverage,
     learning_step,
     reduce_frame,
@@ -115,7 +115,7 @@ class Task:
     def num_decoded(self) -> int:
         """Number of frames that are decoded: all, and those of a pass that learns the background."""
         num_frames = self.video.num_frames
-        if isinstance(self.background, Living | Mog2):
+        if isinstance(self.background, OwnBackground):
             return num_frames
         return num_frames + len(range(0, num_frames, learning_step(num_frames, self.settings)))
 
@@ -272,12 +272,12 @@ def foreground_of(
     """
     video, settings, background = task.video, task.settings, task.background
     # The package's models keep only reduced frames. One that the user brings may keep what it is given.
-    into_one = isinstance(background, Living | Mog2) and settings.working_reduction > 1
+    into_one = isinstance(background, OwnBackground) and settings.working_reduction > 1
     frames = _decoded(read_frames(video, into_one=into_one), seconds, advance, changes)
-    if isinstance(background, Mog2) or (isinstance(background, Living) and settings.first_look):
-        masks = background.masks(*look_first(video, frames, settings))
-    elif isinstance(background, Living):
+    if isinstance(background, Living) and not settings.first_look:
         masks = background.masks_as_they_come(reduce_frame(frame, settings) for frame in frames)
+    elif isinstance(background, OwnBackground):
+        masks = background.masks(*look_first(video, frames, settings))
     else:
         learning = read_frames(video, learning_step(video.num_frames, settings))
         masks = background.foreground(_decoded(learning, seconds, advance), frames)
