@@ -36,6 +36,7 @@ _COMMANDS = {
     },
     "Research": {
         "simulate": "simulate.simulate",
+        "train": "training.train",
         **{name: f"research.{name}" for name in ("sweep", "detect", "cache")},
     },
     "On-board": {"onboard": "onboard.onboard"},

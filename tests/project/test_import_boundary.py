@@ -44,7 +44,7 @@ CORE = {
     "tracking.swarm",
     "trajectories.trajectories",
 }
-CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy"}
+CORE_MAY_USE = {"equinox", "jax", "jaxtyping", "lazy_loader", "numpy", "optax"}
 #: Module of the core -> another library that it may use.
 EXCEPTIONS = {"geometry.rotations": "scipy", "pipeline.results": "msgspec"}
 

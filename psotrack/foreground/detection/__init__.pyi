@@ -6,7 +6,7 @@ from .detector import (
     stored_detections,
 )
 from .settings import DetectorSettings, LabelSettings, Layout
-from .training_data import DATA_SET, box_corners, label_boxes, write_data_set
+from .training_data import DATA_SET, box_corners, label_boxes, parts_of, write_data_set
 
 __all__ = [
     "DATA_SET",
@@ -19,6 +19,7 @@ __all__ = [
     "detect_drones",
     "find_detector",
     "label_boxes",
+    "parts_of",
     "stored_detections",
     "write_data_set",
 ]

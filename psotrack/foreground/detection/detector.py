@@ -31,6 +31,7 @@ from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.detection.settings import DetectorSettings, Layout
+from psotrack.foreground.silhouettes import MODEL_SUFFIX
 from psotrack.recordings import (
     Detections,
     Recording,
@@ -86,6 +87,15 @@ class Detector(Protocol):
             Boxes (found, 4), xyxy in pixels of the frame: x0, y0, x1, y1 with 0 <= x0 < x1 <= width, edges as in
             `psotrack.geometry.boxes`, where pixel 0 reaches from 0 to 1; and confidences (found,) in [0, 1].
         """
+        ...
+
+
+@runtime_checkable
+class LearnsVideo(Protocol):
+    """A detector that looks at a video before it finds drones in the video's frames."""
+
+    def of_video(self, video: VideoInfo) -> Detector:
+        """The detector for the frames of one video."""
         ...
 
 
@@ -261,19 +271,23 @@ def _check_survives(model: Path, size: int, _modified_ns: int) -> None:
 
 
 def find_detector(name: str, settings: DetectorSettings) -> Detector:
-    """The detector that `--detector` names: an ONNX file, or a plugin.
+    """The detector that `--detector` names: an ONNX file, a file of `psotrack train`, or a plugin.
 
     Args:
-        name: path of an ONNX file, or name of a plugin.
+        name: path of such a file, or name of a plugin.
         settings: settings of the detection.
 
     Raises:
         InputError: the file does not exist, or OpenCV cannot read it.
         SettingsError: there is neither such a file nor such a plugin.
     """
+    if Path(name).suffix == MODEL_SUFFIX:
+        from psotrack.foreground.detection.network_detector import NetworkDetector
+
+        return NetworkDetector(name, settings)
     if Path(name).suffix.lower() == ".onnx" or Path(name).exists():
         return OnnxDetector(name, settings)
-    built_in = ["MODEL.onnx (a file)"]
+    built_in = ["MODEL.onnx (a file)", f"DRONES{MODEL_SUFFIX} (a file of `psotrack train`)"]
     return make_plugin("detector", name, settings, interface=Detector, setting="detector", built_in=built_in)
 
 
@@ -292,6 +306,8 @@ def detect_drones(
         InputError: the video ends early, or the network cannot be used.
         SettingsError: the detector yields arrays of other shapes than `Detector` says.
     """
+    if isinstance(detector, LearnsVideo):
+        detector = detector.of_video(video)
     tables = [np.empty((0, 6))]
     with report(name, video.num_frames) as advance:
         for number, bgr in enumerate(read_frames(video)):

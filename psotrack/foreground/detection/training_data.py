@@ -132,7 +132,7 @@ def write_data_set(
         OutputError: the folder exists and `force` is not set, or it cannot be written.
     """
     out = Path(out)
-    parts = _parts([recording.name for recording in recordings], validation)
+    parts = parts_of([recording.name for recording in recordings], validation)
     refuse_to_overwrite(out, force)
     if out.exists() and not (out / DATA_SET).is_file():
         expected, remedy = "a new folder, or a data set", f"only a folder with a {DATA_SET} can be replaced"
@@ -177,7 +177,7 @@ class _Task:
     labels: list[str]
 
 
-def _parts(names: Sequence[str], validation: Sequence[str]) -> dict[str, str]:
+def parts_of(names: Sequence[str], validation: Sequence[str]) -> dict[str, str]:
     """The part of each sequence, `train` or `val`, by the sequence's name."""
     chosen = set(validation or names[-1:])
     if len(set(names)) < len(names) or not chosen < set(names):

@@ -3,24 +3,26 @@ from .cache import CacheEntry, choose_to_prune, list_entries, remove_entry
 from .computation import (
     compute,
     find_background,
+    num_processes,
     scaled_settings,
     stored_silhouettes,
     usual_drone_px,
 )
 from .exposures import Exposures, moved_by
 from .first_look import look_first
-from .foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
+from .foreground import BackgroundModel, Mog2, coverage, learned_mog2, learning_step, reduce_frame
 from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
 from .masks import masks_out, write_masks
 from .repeated_frames import FrameChanges, repeated_frames
-from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
+from .settings import MODEL_SUFFIX, ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import SEAL_FILE, Task, ignored_pixels, is_whole
 from .summed_area import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
 __all__ = [
     "LOW_BITS",
+    "MODEL_SUFFIX",
     "SEAL_FILE",
     "BackgroundModel",
     "CacheEntry",
@@ -47,11 +49,13 @@ __all__ = [
     "foreground_is_everywhere",
     "ignored_pixels",
     "is_whole",
+    "learned_mog2",
     "learning_step",
     "list_entries",
     "look_first",
     "masks_out",
     "moved_by",
+    "num_processes",
     "pack",
     "packed_box_sums",
     "reduce_frame",

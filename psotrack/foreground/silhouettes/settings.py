@@ -11,6 +11,8 @@ from msgspec import Meta
 from psotrack.errors import SettingsError, check_positive
 from psotrack.support import Share, check_types
 
+#: How files of trained networks end (`psotrack train`).
+MODEL_SUFFIX = ".model"
 #: Names of the background models of this package.
 MOG2, LIVING = "mog2", "living"
 

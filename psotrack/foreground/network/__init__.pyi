@@ -1,0 +1,22 @@
+from .finding import USUAL_CONFIDENCE, boxes_of, findings, padded, peaks_of
+from .model_file import Model, from_bytes, head_of, model_at, to_bytes, write_model
+from .network import CELL_PX, Found, Network, inputs_of, untrained
+
+__all__ = [
+    "CELL_PX",
+    "USUAL_CONFIDENCE",
+    "Found",
+    "Model",
+    "Network",
+    "boxes_of",
+    "findings",
+    "from_bytes",
+    "head_of",
+    "inputs_of",
+    "model_at",
+    "padded",
+    "peaks_of",
+    "to_bytes",
+    "untrained",
+    "write_model",
+]

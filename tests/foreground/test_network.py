@@ -1,0 +1,246 @@
+"""The network that finds drones: loss against loops, training, resuming, its file, and its use."""
+
+import functools
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psotrack.foreground.detection import DetectorSettings, find_detector
+from psotrack.foreground.learning import Samples, TrainSettings, train
+from psotrack.foreground.learning.loss import Targets, losses
+from psotrack.foreground.learning.variations import Batch, varied
+from psotrack.foreground.network import Found, findings, model_at
+from psotrack.foreground.silhouettes import ForegroundSettings, find_background
+
+#: Side of the pictures, pixels; and settings with which a network learns ten of them by heart.
+SIDE = 64
+BY_HEART = TrainSettings(epochs=4, steps=60, batch=8, part_px=SIDE, learning_rate=4e-3)
+
+
+def cross(image, x, y, colour):
+    """Draw a drone of 14 x 10 pixels, as a cross."""
+    for sign in (-1, 1):
+        cv2.line(image, (x - 6, y - 4 * sign), (x + 6, y + 4 * sign), colour, 2)
+    return np.array([x - 7, y - 5, x + 8, y + 6], float)
+
+
+@functools.cache
+def pictures(count=10):
+    """Pictures with two drones each before a background that is known."""
+    generator = np.random.default_rng(0)
+    small = generator.integers(60, 200, (8, 8, 3), np.uint8)
+    background = cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+    images, covered, boxes = (
+        np.repeat(background[None], count, 0),
+        np.zeros((count, SIDE, SIDE), np.uint8),
+        [],
+    )
+    for image, mask in zip(images, covered, strict=True):
+        places = [(int(generator.integers(10, 54)), y) for y in (16, 46)]
+        boxes.append([cross(mask, *place, 255) for place in places])
+        for place in places:
+            cross(image, *place, (20, 20, 20))
+    return Samples(images, background, covered, np.array(boxes), "pictures")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A network that learned ten pictures by heart."""
+    out = tmp_path_factory.mktemp("network") / "drones.model"
+    train([pictures()], [pictures()], out, BY_HEART, about={"pictures": 10})
+    return out
+
+
+# --- loss
+
+
+def entropy(logit, share):
+    """Cross entropy of a probability with a share."""
+    probability = 1 / (1 + np.exp(-logit))
+    return -share * np.log(probability) - (1 - share) * np.log(1 - probability)
+
+
+def test_the_loss_agrees_with_loops():
+    generator = np.random.default_rng(1)
+    pixel, middle = generator.normal(0, 2, (2, 8, 12)), generator.normal(-1, 2, (2, 4, 6))
+    box = generator.normal(0, 1, (2, 4, 6, 4))
+    covered, counts = generator.uniform(0, 1, (2, 8, 12)), generator.random((2, 8, 12)) < 0.8
+    # Two drones in the first image: middles at cells (2, 1) and (4, 3); none in the second.
+    box_px = np.full((2, 2, 4), np.nan)
+    box_px[0] = [[2.0, 1.0, 8.0, 5.0], [7.0, 5.0, 12.0, 8.0]]
+    found = Found(*(jnp.asarray(each, jnp.float32) for each in (pixel, middle, box)))
+    got = losses(
+        found, Targets(*map(jnp.asarray, (covered.astype(np.float32), counts, box_px.astype(np.float32))))
+    )
+
+    wanted_px = entropy(pixel, covered)[counts].sum() / (covered[counts].sum() + 2 * 30)
+    wanted_middle, wanted_box, learning = 0.0, 0.0, 0
+    for image in range(2):
+        for row in range(4):
+            for column in range(6):
+                bells = []
+                for x0, y0, x1, y1 in box_px[image][np.isfinite(box_px[image, :, 0])] / 2:
+                    middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
+                    dx, dy = middle_x - column - 0.5, middle_y - row - 0.5
+                    wide, high = max((x1 - x0) / 6, 0.6), max((y1 - y0) / 6, 0.6)
+                    bell = min(np.exp(-0.5 * ((dx / wide) ** 2 + (dy / high) ** 2)), 0.999)
+                    if (int(middle_x), int(middle_y)) == (column, row):
+                        bell = 1.0
+                    bells.append((bell, [dx, dy, np.log((x1 - x0) / 2), np.log((y1 - y0) / 2)]))
+                bell, told = max(bells, default=(0.0, None), key=lambda each: each[0])
+                logit = middle[image, row, column]
+                share = 1 / (1 + np.exp(-logit))
+                if bell == 1:
+                    wanted_middle += (1 - share) ** 2 * entropy(logit, 1)
+                else:
+                    wanted_middle += (1 - bell) ** 4 * share**2 * entropy(logit, 0)
+                if bell > 0.4:
+                    wanted_box += np.abs(box[image, row, column] - told).sum()
+                    learning += 1
+    # Single precision.
+    np.testing.assert_allclose(got.pixel, wanted_px, rtol=1e-5)
+    np.testing.assert_allclose(got.middle, wanted_middle / (2 + 2), rtol=1e-5)
+    np.testing.assert_allclose(got.box, wanted_box / (learning + 1), rtol=1e-5)
+
+
+@given(seed=st.integers(0, 2**31), is_known=st.booleans())
+@settings(max_examples=10, deadline=None)
+def test_random_changes_keep_what_is_to_be_learned(seed, is_known):
+    samples = pictures()
+    known = np.full(4, is_known)
+    background = np.repeat(np.asarray(samples.background)[None], 4, 0)
+    arrays = samples.image[:4], background, samples.covered[:4], samples.covered[:4] >= 0
+    batch = Batch(*arrays, samples.box_px[:4].astype(np.float32), known)
+    inputs, targets = jax.jit(varied)(jax.random.key(seed), batch)
+    assert np.isfinite(inputs).all()
+    assert np.abs(inputs).max() <= 2
+    np.testing.assert_array_equal(targets.covered, samples.covered[:4] / np.float32(255))
+    np.testing.assert_array_equal(targets.box_px, batch.box_px)
+    if not is_known:
+        assert not np.asarray(inputs[..., 3:]).any()
+
+
+# --- training
+
+
+@pytest.mark.slow
+def test_ten_pictures_are_learned_by_heart(trained):
+    found = model_at(trained).card["validation"]
+    # The rest are pixels at contours, and drones that hide each other by chance.
+    assert found["pixel_f"] > 0.85
+    assert found["recall"] > 0.95
+    assert found["false_per_frame"] < 0.2
+    assert trained.with_suffix(".png").stat().st_size > 10_000
+    assert not list(trained.parent.glob("*.unfinished"))
+
+
+QUICK = TrainSettings(epochs=2, steps=2, batch=2, part_px=32)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_bytes(tmp_path):
+    def interrupt(line):
+        raise KeyboardInterrupt
+
+    about = {"pictures": 10}
+    train([pictures()], [pictures()], tmp_path / "whole.model", QUICK, about=about)
+    said = []
+    with pytest.raises(KeyboardInterrupt):
+        # Epoch 2 is cut off, and done again.
+        train(
+            *([pictures()], [pictures()], tmp_path / "part.model", QUICK),
+            about=about,
+            say=lambda line: said.append(line) if not said else interrupt(line),
+        )
+    assert (tmp_path / "part.unfinished").exists()
+    assert not (tmp_path / "part.model").exists()
+    other = TrainSettings(epochs=2, steps=3, batch=2, part_px=32)
+    assert_refused(
+        lambda: train([pictures()], [pictures()], tmp_path / "part.model", other, about=about),
+        "no unfinished training, or one with these samples and settings",
+        unchanged=tmp_path,
+    )
+    train([pictures()], [pictures()], tmp_path / "part.model", QUICK, about=about)
+    assert (tmp_path / "part.model").read_bytes() == (tmp_path / "whole.model").read_bytes()
+    assert not (tmp_path / "part.unfinished").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({"box_px": np.full((10, 2, 4), np.nan)}, "no drone in any frame"),
+        ({"image": np.full((10, SIDE, SIDE, 3), 7, np.uint8)}, "frames of one colour"),
+    ],
+)
+def test_samples_that_teach_nothing_are_refused(change, found, tmp_path):
+    samples = Samples(**{**vars(pictures()), **change})
+    assert_refused(
+        lambda: train([samples], [pictures()], tmp_path / "drones.model", QUICK, about={}),
+        found,
+        unchanged=tmp_path,
+    )
+
+
+# --- the file
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (None, "no such file"),
+        (b"", "another kind of file"),
+        (b"\x00\xff" * 40, "another kind of file"),
+        (b'{"kind": "psotrack network", "version": 9}\n', "version 9"),
+        (b'{"kind": "psotrack network", "version": 1, "card": {}}\nnothing', "a damaged file"),
+    ],
+)
+def test_a_file_that_is_no_network_is_one_line(content, found, tmp_path):
+    path = tmp_path / "drones.model"
+    if content is not None:
+        path.write_bytes(content)
+    for use in (
+        lambda: find_detector(str(path), DetectorSettings()),
+        lambda: find_background(str(path), ForegroundSettings()),
+    ):
+        assert_refused(use, found, unchanged=tmp_path)
+
+
+# --- its use
+
+
+@pytest.mark.slow
+def test_it_serves_as_background_model_and_detector(trained):
+    samples = pictures()
+    whole = [
+        cv2.resize(image, (2 * SIDE, 2 * SIDE), interpolation=cv2.INTER_NEAREST) for image in samples.image
+    ]
+    model = find_background(
+        str(trained), ForegroundSettings(reduction=2, working_reduction=2, min_blob_px=16)
+    )
+    masks = np.array(list(model.foreground(whole, whole)))
+    both = (masks >= 128) & (samples.covered >= 128)
+    assert masks.dtype == np.uint8
+    assert masks.shape == samples.covered.shape
+    assert 2 * both.sum() / ((masks >= 128).sum() + (samples.covered >= 128).sum()) > 0.85
+    # Without a background, in pixels of the frame.
+    boxes, confidence = find_detector(str(trained), DetectorSettings(size=SIDE)).boxes(whole[0])
+    assert boxes.shape == (len(confidence), 4)
+    assert (boxes >= 0).all()
+    assert (boxes <= 2 * SIDE).all()
+    share, own, _ = findings(model_at(trained).network, samples.image[0], None)
+    assert share.shape == (SIDE, SIDE)
+    assert len(own) <= len(confidence)
+
+
+def test_the_sides_of_a_frame_need_not_be_multiples_of_eight(tmp_path):
+    path = Path(tmp_path) / "drones.model"
+    model = train([pictures()], [pictures()], path, QUICK, about={})
+    share, boxes, _ = findings(model.network, np.zeros((37, 53, 3), np.uint8), None, 0.0)
+    assert share.shape == (37, 53)
+    assert np.isfinite(boxes).all()
