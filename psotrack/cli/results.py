@@ -11,7 +11,7 @@ import click
 from psotrack import support
 from psotrack.calibration import clocks
 from psotrack.cli.commands import OptionGroup, command
-from psotrack.cli.options import Bodies, Cache, Plot, SeqOfTracks, cache_folder, sequence_of
+from psotrack.cli.options import DETECTOR_SIZE, Bodies, Cache, Plot, SeqOfTracks, cache_folder, sequence_of
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import Words, says
 from psotrack.errors import OutputError, SettingsError, errors_name
@@ -138,12 +138,13 @@ def export(
     tracks: Path,
     sequence: SeqOfTracks = None,
     *,
-    to: Annotated[str, says(type=click.Choice(FORMAT_NAMES))],
+    to: Annotated[str, says(type=click.Choice([*FORMAT_NAMES, "onnx"]))],
     out: Path | None = None,
     images: bool = False,
     drone_size_m: Annotated[tuple[float, float, float] | None, says(metavar="X,Y,Z")] = None,
+    size: int = DETECTOR_SIZE,
 ) -> None:
-    """Write TRACKS in a format of another program.
+    """Write TRACKS, or a network of `psotrack train`, in a format of another program.
 
     A line says what the format cannot hold. SEQ adds what only its cameras have: for mot the boxes in each camera, for
     mcap the cameras and with --images their images. `psotrack evaluate OUT SEQ` reads all of these formats again.
@@ -154,17 +155,26 @@ def export(
       psotrack export tracks.csv --to c3d --out tracks.c3d
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mot --out mot
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mcap --out flight.mcap --images
+      psotrack export drones.model --to onnx --out drones.onnx
 
     Options:
-        to: format of the output.
+        to: format of the output; onnx is that of a network, which `psotrack detect` and other programs read.
         out: file of the output; a folder for tum with several drones, kitti, and mot with SEQ. None: beside TRACKS,
             with the format in its name.
         images: write the images of SEQ's cameras too; only with --to mcap.
         drone_size_m: full lengths of a drone along x, y and z, in metres, for boxes of --to mot. None: those that the
             record beside TRACKS has.
+        size: height and width of the images of --to onnx, pixels, a multiple of 8.
     """
     out = out or tracks.with_name(f"{tracks.stem}_{to}{_SUFFIXES.get(to, '')}")
     _check_options(tracks, sequence, to, out, images)
+    if to == "onnx":
+        from psotrack.foreground.network import model_at, write_onnx
+
+        output.refuse(out)
+        write_onnx(out, model_at(tracks).network, size)
+        output.say(f"{out}: a network for images of {size} x {size} pixels, in the layout v8 of YOLO")
+        return
     recording = None if sequence is None else datasets.open_recording(sequence)
     trajectories = exchange.read_tracks(tracks, recording=recording)
     footage = None

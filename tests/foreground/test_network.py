@@ -1,12 +1,14 @@
 """The network that finds drones: loss against loops, training, resuming, its file, and its use."""
 
 import functools
+import json
 from pathlib import Path
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 import pytest
 from helpers import assert_refused
 from hypothesis import given, settings
@@ -14,10 +16,21 @@ from hypothesis import strategies as st
 
 from psotrack.foreground.detection import DetectorSettings, find_detector
 from psotrack.foreground.learning import Samples, TrainSettings, train
+from psotrack.foreground.learning.data_sets import read_data_set
 from psotrack.foreground.learning.loss import Targets, losses
+from psotrack.foreground.learning.samples import batches, gather
+from psotrack.foreground.learning.tracked import TrackedDrones
 from psotrack.foreground.learning.variations import Batch, varied
-from psotrack.foreground.network import Found, findings, model_at
-from psotrack.foreground.silhouettes import ForegroundSettings, find_background
+from psotrack.foreground.network import Found, findings, model_at, untrained, write_onnx
+from psotrack.foreground.silhouettes import (
+    ForegroundSettings,
+    SilhouetteSettings,
+    find_background,
+    scaled_settings,
+)
+from psotrack.recordings.datasets import open_recording
+from psotrack.simulation import SimulationSettings, simulate
+from psotrack.trajectories import write_trajectories
 
 #: Side of the pictures, pixels; and settings with which a network learns ten of them by heart.
 SIDE = 64
@@ -187,6 +200,77 @@ def test_samples_that_teach_nothing_are_refused(change, found, tmp_path):
     )
 
 
+# --- what it learns from
+
+
+@pytest.fixture
+def data_set(tmp_path):
+    """A YOLO data set of two images for training and two for validation, 1300 pixels wide, one without drones."""
+    folder = tmp_path / "yolo"
+    for part in ("train", "val"):
+        for kind in ("images", "labels"):
+            (folder / kind / part).mkdir(parents=True)
+        for number in range(2):
+            image = np.full((130, 1300, 3), 90 + 5 * number, np.uint8)
+            cross(image, 300, 60, (10, 10, 10))
+            cv2.imwrite(str(folder / "images" / part / f"{number}.png"), image)
+        (folder / "labels" / part / "0.txt").write_text("0 0.230769 0.461538 0.015385 0.092308\n")
+    (folder / "data.yaml").write_text("path: /somewhere/else\ntrain: images/train\nval: images/val\nnc: 1\n")
+    return folder
+
+
+def test_a_yolo_data_set_has_boxes_and_no_masks(data_set, tmp_path):
+    train_on, validate_on = read_data_set(data_set, cache=tmp_path / "cache")
+    ((samples,), (other,)) = train_on, validate_on
+    assert samples.by_boxes
+    assert samples.image.shape == (2, 44, 434, 3)  # reduced by 3
+    # 20 x 12 pixels about (300, 60).
+    np.testing.assert_allclose(samples.box_px[0, 0], [290 / 3, 54 / 3, 310 / 3, 66 / 3], atol=1e-3)
+    assert np.isnan(samples.box_px[0, 1:]).all()
+    assert np.isnan(samples.box_px[1]).all()
+    batch = next(batches([samples, other], 32, 8, np.random.default_rng(0)))
+    assert not np.asarray(batch.is_known).any()
+    np.testing.assert_array_equal(batch.counts, np.asarray(batch.covered) == 0)
+    assert not np.asarray(batch.counts).all()
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "found"),
+    [
+        ("data.yaml", "train: images/train\n", "expected `val`, a folder of images in"),
+        ("data.yaml", "[", "expected the description of a data set in YAML, found none"),
+        ("labels/val/0.txt", "0 a b c d\n", "expected lines of a class and four numbers"),
+        ("labels/val/0.txt", "0 0.5 7 0.1 0.1\n", "as shares of the image, 0 to 1"),
+    ],
+)
+def test_a_data_set_that_is_none_is_one_line(file, content, found, data_set, tmp_path):
+    (data_set / file).write_text(content)
+    assert_refused(lambda: read_data_set(data_set, cache=tmp_path / "cache"), found, unchanged=data_set)
+
+
+@pytest.mark.slow
+def test_tracks_teach_what_masks_teach(tmp_path):
+    """The foreground near tracks covers the pixels of the masks, but for thin arms and shadows."""
+    simulate("S02_D4_A", tmp_path, SimulationSettings(num_frames=50, scale=0.25, onboard=False))
+    recording = open_recording(tmp_path / "Simulated_Data" / "S02_D4_A").usable(["cam1", "cam2"])
+    tracks = tmp_path / "tracks.csv"
+    write_trajectories(tracks, recording.truth)
+    assert_refused(lambda: TrackedDrones.read(tracks), unchanged=tmp_path)
+    drones = [{"drone": name, "size_m": [0.45, 0.45, 0.25]} for name in recording.truth.drones]
+    tracks.with_suffix(".json").write_text(json.dumps({"drones": drones}))
+    settings = scaled_settings(SilhouetteSettings(), recording)
+    common = {"per_camera": 10, "cache": tmp_path / "cache", "jobs": 1}
+    drawn = gather(recording, settings, **common)
+    found = gather(recording, settings, tracked=TrackedDrones.read(tracks), **common)
+    for by_masks, by_tracks in zip(drawn, found, strict=True):
+        # Frames in which a drone has no foreground are left out.
+        assert 5 <= len(by_tracks) <= len(by_masks)
+        kept = [(each[None] == by_tracks.image).all(axis=(1, 2, 3)).any() for each in by_masks.image]
+        first, second = by_masks.covered[kept] >= 128, by_tracks.covered >= 128
+        assert 2 * (first & second).sum() / (first.sum() + second.sum()) > 0.7
+        assert np.nanmedian(np.abs(by_masks.box_px[kept] - by_tracks.box_px)) <= 2
+
+
 # --- the file
 
 
@@ -236,6 +320,32 @@ def test_it_serves_as_background_model_and_detector(trained):
     share, own, _ = findings(model_at(trained).network, samples.image[0], None)
     assert share.shape == (SIDE, SIDE)
     assert len(own) <= len(confidence)
+
+
+def test_its_onnx_file_finds_the_same(tmp_path):
+    path, network = tmp_path / "drones.onnx", untrained(3)
+    assert_refused(lambda: write_onnx(path, network, 60), "a multiple of 8, found 60", unchanged=tmp_path)
+    write_onnx(path, network, SIDE)
+    image = np.asarray(pictures().image[0])
+    blob = cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True)
+    (got,) = onnxruntime.InferenceSession(path).run(None, {"images": blob})
+    share, boxes, confidence = findings(network, image, None, 0.0)
+    assert share.shape == (SIDE, SIDE)
+    # Peaks only; the file tells all cells. Both compute in single precision.
+    x, y, width, height = got[0, :4].astype(float)
+    corners = np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=-1)
+    is_peak = confidence > 0
+    assert is_peak.sum() > 10
+    for box, told in zip(boxes[is_peak], confidence[is_peak], strict=True):
+        nearest = np.abs(corners - box).max(axis=1).argmin()
+        np.testing.assert_allclose(corners[nearest], box, atol=1e-3)
+        np.testing.assert_allclose(got[0, 4, nearest], told, atol=1e-5)
+    # OpenCV takes it as any other network.
+    least = float(np.sort(confidence)[-5])
+    detector = find_detector(str(path), DetectorSettings(size=SIDE, confidence=least, nms=1.0))
+    found, score = detector.boxes(image)
+    assert len(found) >= 5
+    np.testing.assert_allclose(score.max(), confidence.max(), atol=1e-5)
 
 
 def test_the_sides_of_a_frame_need_not_be_multiples_of_eight(tmp_path):

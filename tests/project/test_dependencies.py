@@ -46,7 +46,7 @@ def imported(folder: str) -> frozenset[str]:
 
 
 #: Extras of the package.
-EXTRAS = ("control", "live", "view", "ros", "dask")
+EXTRAS = ("control", "live", "view", "ros", "onnx", "dask")
 
 
 def test_what_is_declared_is_imported() -> None:

@@ -31,7 +31,9 @@ def draw_findings(
         for number, (above, below) in enumerate(axes.T[:-1]):
             each = samples[number * len(samples) // _NUM_FRAMES]
             index = len(each) // 2
-            share, boxes, confidence = findings(network, each.image[index], each.background)
+            share, boxes, confidence = findings(
+                network, each.image[index], None if each.by_boxes else each.background
+            )
             above.imshow(np.asarray(each.image[index])[..., ::-1])
             below.imshow(share, vmin=0, vmax=1, cmap="gray")
             for (x0, y0, x1, y1), told in zip(boxes, confidence, strict=True):

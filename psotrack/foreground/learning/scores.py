@@ -22,7 +22,7 @@ class Scores(NamedTuple):
 
     Attributes:
         loss: mean loss.
-        pixel_f: F-measure of pixels that are covered by a half at least.
+        pixel_f: F-measure of pixels that are covered by a half at least, where masks are known.
         recall: share of the drones that are found.
         false_per_frame: boxes per frame that are no drone's.
     """
@@ -43,8 +43,9 @@ def score(network: Network, samples: Sequence[Samples]) -> Scores:
             batch = _whole(each, index)
             total, share, middle, box = map(np.asarray, look(network, batch))
             is_found, is_shown = share[:height, :width] >= 0.5, np.asarray(each.covered[index]) >= 128
-            found_px, shown_px = found_px + is_found.sum(), shown_px + is_shown.sum()
-            both_px += (is_found & is_shown).sum()
+            if not each.by_boxes:
+                found_px, shown_px = found_px + is_found.sum(), shown_px + is_shown.sum()
+                both_px += (is_found & is_shown).sum()
             boxes, _ = boxes_of(middle, box, USUAL_CONFIDENCE)
             truth = np.array(each.box_px[index])
             truth = truth[np.isfinite(truth).all(axis=1)]
@@ -62,7 +63,8 @@ def _whole(samples: Samples, index: int) -> Batch:
     rows, columns = samples.covered[index].shape
     covered[:rows, :columns] = samples.covered[index]
     box_px = np.array(samples.box_px[index], np.float32)
-    arrays = image, background, covered, np.ones(covered.shape, bool), box_px, np.array(True)
+    counts = (covered == 0) | (not samples.by_boxes)
+    arrays = image, background, covered, counts, box_px, np.array(not samples.by_boxes)
     return Batch(*(each[None] for each in arrays))
 
 

@@ -15,6 +15,8 @@ class TrainSettings(msgspec.Struct, frozen=True):
 
     Attributes:
         validation: names of the sequences for validation, not for training. None: the last sequence.
+        from_tracks: whether SEQ/results/tracks.csv says where the drones are, and the foreground which pixels they
+            cover; else the masks of simulated sequences say both.
         per_camera: largest number of frames of each camera that are learned, spread over its video.
         epochs: largest number of epochs; the network of the best one is kept.
         steps: steps of an epoch.
@@ -29,6 +31,7 @@ class TrainSettings(msgspec.Struct, frozen=True):
     """
 
     validation: tuple[str, ...] | None = None
+    from_tracks: bool = False
     per_camera: Annotated[int, Meta(ge=2)] = 40
     epochs: Annotated[int, Meta(ge=1)] = 40
     steps: Annotated[int, Meta(ge=1)] = 200

@@ -16,12 +16,14 @@ import msgspec
 import numpy as np
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.foreground.detection import parts_of
+from psotrack.foreground.detection import DATA_SET, parts_of
+from psotrack.foreground.learning.data_sets import read_data_set
 from psotrack.foreground.learning.pictures import draw_findings
 from psotrack.foreground.learning.samples import Samples, batches, gather
 from psotrack.foreground.learning.scores import score
 from psotrack.foreground.learning.settings import TrainSettings
 from psotrack.foreground.learning.steps import State, Teacher
+from psotrack.foreground.learning.tracked import TrackedDrones
 from psotrack.foreground.network import Model, from_bytes, head_of, to_bytes, write_model
 from psotrack.foreground.silhouettes import SilhouetteSettings, num_processes, scaled_settings
 from psotrack.recordings.datasets import open_recording
@@ -45,10 +47,10 @@ def train_on_sequences(
     report: Report = no_progress,
     say: Callable[[str], object] = lambda line: None,
 ) -> Model:
-    """Train a network on simulated sequences, and write its file.
+    """Train a network on sequences whose drones are known, and write its file.
 
     Args:
-        sequences: folders of at least two sequences, with masks of their drones.
+        sequences: at least two sequences, with masks of their drones or tracks; or folders of YOLO data sets.
         out: the model file.
         settings: settings of the training.
         cache: folder for stored results.
@@ -57,26 +59,43 @@ def train_on_sequences(
         say: is told a line after each epoch.
 
     Raises:
-        InputError: a sequence cannot be read, has no masks, or no drones are seen.
+        InputError: a sequence cannot be read, has neither masks nor tracks, or no drones are seen.
         SettingsError: two sequences have the same name, a validation name is unknown, or no sequence is left for
             training or validation.
         OutputError: a file cannot be written.
     """
-    recordings = [open_recording(sequence).usable() for sequence in sequences]
-    parts = parts_of([recording.name for recording in recordings], settings.validation or ())
     found: dict[str, list[Samples]] = {"train": [], "val": []}
     about: dict[str, Any] = {"train": {}, "val": {}}
-    for recording in recordings:
-        scaled, part = scaled_settings(SilhouetteSettings(), recording), parts[recording.name]
-        number = num_processes(jobs)
-        made = gather(
-            recording, scaled, per_camera=settings.per_camera, cache=cache, jobs=number, report=report
-        )
-        if part == "val":
-            made = [each.thinned(_VALIDATED) for each in made]
+
+    def add(name: str, part: str, made: list[Samples]) -> None:
+        made = [each.thinned(_VALIDATED) if part == "val" and not each.by_boxes else each for each in made]
         found[part] += made
-        number_of = sum(map(len, made))
-        about[part][recording.name] = {"samples": number_of, "of": digest_record([each.key for each in made])}
+        content = digest_record([each.key for each in made])
+        about[part][name] = {"samples": sum(map(len, made)), "content": content}
+
+    data_sets = [path for path in sequences if (path / DATA_SET).is_file()]
+    for path in data_sets:
+        of_parts = read_data_set(path, cache=cache, report=report)
+        for part, made in zip(("train", "val"), of_parts, strict=True):
+            add(path.name, part, made)
+    recordings = [open_recording(path).usable() for path in sequences if path not in data_sets]
+    names = [recording.name for recording in recordings]
+    if recordings and (settings.validation or not data_sets):
+        parts = parts_of(names, settings.validation or ())
+    else:
+        parts = dict.fromkeys(names, "train")  # the data sets validate
+    for recording in recordings:
+        tracks = recording.folder / "results" / "tracks.csv"
+        made = gather(
+            recording,
+            scaled_settings(SilhouetteSettings(), recording),
+            tracked=TrackedDrones.read(tracks) if settings.from_tracks else None,
+            per_camera=settings.per_camera,
+            cache=cache,
+            jobs=num_processes(jobs),
+            report=report,
+        )
+        add(recording.name, parts[recording.name], made)
     return train(found["train"], found["val"], out, settings, about=about, report=report, say=say)
 
 

@@ -1,6 +1,7 @@
 from .finding import USUAL_CONFIDENCE, boxes_of, findings, padded, peaks_of
 from .model_file import Model, from_bytes, head_of, model_at, to_bytes, write_model
 from .network import CELL_PX, Found, Network, inputs_of, untrained
+from .onnx_file import write_onnx
 
 __all__ = [
     "CELL_PX",
@@ -19,4 +20,5 @@ __all__ = [
     "to_bytes",
     "untrained",
     "write_model",
+    "write_onnx",
 ]

@@ -28,7 +28,7 @@ _DIFFERENCE, _LARGEST_DIFFERENCE = 64.0, 2.0
 #: Share of the cells with the middle of a drone before training: the loss then begins near its right size.
 _PRIOR = 0.01
 #: Logarithms of a box's half lengths in cells are within these limits: 0.05 cells to 400.
-_LOG_SIZE = (-3.0, 6.0)
+LOG_SIZE = (-3.0, 6.0)
 
 Images = UInt8[Array, "images height width 3"]
 
@@ -141,7 +141,7 @@ class Network(eqx.Module):
         half = jax.nn.relu(self.joined[1](half + _doubled(self.up[1](quarter))))
         heads = self.heads(half)
         pixels, middle, box = heads[..., :4], heads[..., 4], heads[..., 5:]
-        log_size = jnp.clip(box[..., 2:], *_LOG_SIZE)
+        log_size = jnp.clip(box[..., 2:], *LOG_SIZE)
         return Found(_spread(pixels), middle, jnp.concatenate([box[..., :2], log_size], axis=-1))
 
 

@@ -16,7 +16,7 @@ from .living_background import Living, LivingBackground
 from .masks import masks_out, write_masks
 from .repeated_frames import FrameChanges, repeated_frames
 from .settings import MODEL_SUFFIX, ForegroundSettings, Shadows, SilhouetteSettings, check_whole
-from .store import SEAL_FILE, Task, ignored_pixels, is_whole
+from .store import SEAL_FILE, Task, ignored_pixels, is_whole, reduced_shape
 from .summed_area import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
@@ -59,6 +59,7 @@ __all__ = [
     "pack",
     "packed_box_sums",
     "reduce_frame",
+    "reduced_shape",
     "remove_entry",
     "repeated_frames",
     "scaled_settings",
