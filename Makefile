@@ -20,7 +20,7 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow nightly real fuzz kills mutants lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results reference-flights clean
+.PHONY: help demo test test-slow nightly real fuzz kills mutants network lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results reference-flights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -83,6 +83,9 @@ format: $(VENV)/.installed  ## let ruff mend and format
 
 size:  ## lines of code per room, and their budgets
 	@$(PYTHON) experiments/size.py
+
+network: $(VENV)/.installed  ## train the network that finds drones: two hours
+	@$(BIN)/python experiments/network.py $(if $(DATA),--data $(DATA))
 
 bench: bench-videos  ## from videos to tracks, stage by stage: as fast as the cameras?
 

@@ -47,8 +47,8 @@ def draw_findings(
         losses.plot(epochs, [each["loss"] for each in history], label="loss, validation")
         losses.set_yscale("log")
         for name in ("pixel_f", "recall", "false_per_frame"):
-            shares.plot(epochs, [each[name] for each in history], label=name)
-        shares.set(xlabel="epoch", ylim=(0, 1.05))
+            shares.plot(epochs, [each[name] for each in history], label=name.replace("_", " "))
+        shares.set(xlabel="epoch", ylim=(0, 2))
         for axis in (losses, shares):
             axis.legend()
 
