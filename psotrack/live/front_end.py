@@ -33,7 +33,7 @@ from psotrack.foreground.silhouettes import (
     ignored_pixels,
     reduce_frame,
 )
-from psotrack.live.meeting import STOPPED_S, Instant, Meeting
+from psotrack.live.meeting import BEHIND, STOPPED_S, Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import ANSWER_S, LiveCamera, SourceFrame
 from psotrack.support import with_traceback, workers
@@ -54,8 +54,8 @@ _LEAD_S = 0.2
 _LISTEN_S = 0.1
 #: Longest time that the cameras have to end, seconds: OpenCV waits 10 s for a device that does not answer.
 _END_S = 10.0 + ANSWER_S + CLOSE_S
-#: A camera is behind from this share of the longest wait on, and learns one of so many frames only.
-_BEHIND, _LEARN_EVERY = 0.5, 3
+#: A camera that is behind learns every third frame only.
+_LEARN_EVERY = 3
 #: Lower priority of the processes of cameras, as `nice` counts it: an instant that is complete comes first.
 _NICE = 5
 
@@ -266,9 +266,9 @@ def _film(
     def is_stopped() -> bool:
         return bool(shared.is_stopped[0])
 
-    root = logging.getLogger("psotrack")
-    root.addHandler(_Sent(send))
-    root.setLevel(logging.INFO)
+    package = logging.getLogger("psotrack")
+    package.addHandler(_Sent(send))
+    package.setLevel(logging.INFO)  # the parent process knows what is to be told
     _rehearse(settings, camera)
     filming, error, recorded = _Filming(camera, index, settings, wait_s, shared, send), None, None
     try:
@@ -298,7 +298,7 @@ def _rehearse(settings: ForegroundSettings, camera: LiveCamera) -> None:
 
 
 class _Sent(logging.handlers.QueueHandler):
-    """Sends what is logged to the parent process, which knows what is to be told."""
+    """Sends what is logged to the parent process."""
 
     def __init__(self, send: Callable[[object], None]) -> None:
         super().__init__(queue.SimpleQueue())
@@ -341,7 +341,7 @@ class _Filming:
         is_unseen = not is_late and time_s - self._shown_s > STOPPED_S
         self._send(_Said(_UNSEEN if is_unseen else ""))
         self._num_unlearned += 1
-        is_behind = time.monotonic() - frame.arrived_s > _BEHIND * self._wait_s
+        is_behind = time.monotonic() - frame.arrived_s > BEHIND * self._wait_s
         if not is_late and (not is_behind or self._num_unlearned >= _LEARN_EVERY):
             self._wait_for_others(time_s)
             self._silhouettes.learn()

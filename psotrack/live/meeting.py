@@ -22,6 +22,9 @@ from psotrack.recordings import REACH
 _LEAST_INTERVAL = 0.8
 #: A frame that comes sooner after the one before, in intervals, is the same frame again.
 _DOUBLED = 0.3
+#: A camera or a session whose delay is longer than this share of the longest wait is behind: it does less, before
+#: anything is left out.
+BEHIND = 0.5
 #: A camera has stopped when no frame came for this time, seconds.
 STOPPED_S = 1.0
 

@@ -15,7 +15,7 @@ import numpy as np
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.foreground.silhouettes import Exposures, usual_drone_px
 from psotrack.live.front_end import FrontEnd
-from psotrack.live.meeting import Instant, Meeting, MeetingCamera
+from psotrack.live.meeting import BEHIND, Instant, Meeting, MeetingCamera
 from psotrack.live.recorder import RecordedCounts
 from psotrack.live.sources import LiveCamera
 from psotrack.pipeline import causal_settings, causal_tracker
@@ -27,8 +27,8 @@ logger = logging.getLogger(__name__)
 
 #: How long an instant waits for cameras, and a frame for the processor, seconds.
 WAIT_S = 0.1
-#: A session is behind from this share of `WAIT_S` on, and searches for drones in one of so many instants only.
-_BEHIND, _SEARCHES_EVERY = 0.5, 3
+#: A session that is behind searches for drones at every third instant only.
+_SEARCHES_EVERY = 3
 #: Time after which a thread hands on Python's lock, seconds.
 _SWITCH_S = 0.0005
 
@@ -154,7 +154,7 @@ class LiveSession:
                     if on_instant is not None:
                         on_instant(result)
                     # A search takes longer than a step: it must not be the reason why frames are left out.
-                    is_behind = result.delay_s[-1] > _BEHIND * self._meeting.wait_s
+                    is_behind = result.delay_s[-1] > BEHIND * self._meeting.wait_s
                     if not is_behind or result.instants % _SEARCHES_EVERY == 0:
                         self._tracker.look_ahead()
         finally:

@@ -10,16 +10,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
+from psotrack.foreground.detection.detector import FoundBoxes
 from psotrack.foreground.detection.settings import DetectorSettings
 from psotrack.foreground.network import findings, model_at
 from psotrack.foreground.silhouettes import ForegroundSettings, learned_mog2, learning_step, reduce_frame
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import digest_file
-
-#: Boxes (found, 4) and confidences (found,), as `Detector` describes them.
-FoundBoxes = tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]
 
 _Image = UInt8[np.ndarray, "height width 3"]
 
