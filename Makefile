@@ -98,8 +98,8 @@ notebooks: $(VENV)/.installed  ## run the notebooks and write them with their ou
 table5: $(VENV)/.installed  ## the paper's Table 5 beside ours, an hour; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table5/table5.py $(if $(DATA),--data $(DATA))
 
-table4: $(VENV)/.installed  ## the paper's Table 4: projection lines, beside the swarm; DATA=FOLDER for the published sequences
-	@$(BIN)/python experiments/table4/table4.py $(if $(DATA),--data $(DATA))
+table4: $(VENV)/.installed  ## the paper's Table 4: projection lines, beside the swarm; DATA=FOLDER for the published sequences, DETECTOR=trained for a network's detections too
+	@$(BIN)/python experiments/table4/table4.py $(if $(DATA),--data $(DATA)) $(if $(DETECTOR),--detector $(DETECTOR))
 
 table5-quick: $(VENV)/.installed  ## a small form of Table 5: the smallest and the largest swarms, ten minutes
 	@$(BIN)/python experiments/table5/table5.py --quick $(if $(DATA),--data $(DATA))

@@ -7,6 +7,7 @@
     python experiments/accuracy/accuracy.py association --data data --real REAL
     python experiments/accuracy/accuracy.py markers --real REAL
     python experiments/accuracy/accuracy.py localise --data data
+    python experiments/accuracy/accuracy.py foreground --data data --real REAL
 
 REAL is the folder of recordings that other people published, as OWNER/NAME. Each study simulates what is missing below
 --data, writes a row per run and a record, and prints the table. The same command continues an interrupted study, if
@@ -26,6 +27,7 @@ from typing import Any
 import association
 import baseline
 import covariances
+import foreground
 import localise
 import markers
 import pandas as pd
@@ -42,6 +44,7 @@ STUDIES = {
     "covariances": covariances,
     "association": association,
     "markers": markers,
+    "foreground": foreground,
     "localise": localise,
 }
 

@@ -2,14 +2,20 @@
 
     python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated into data/ if missing
     python experiments/table4/table4.py --data FOLDER_OF_THE_DATASET    # every sequence in it that has a reference
+    python experiments/table4/table4.py --detector trained   # also detections by a network that is trained first
 
-FNR is the share of frames and drones that were missed. Writes the tables, table4.md, and the files of `psotrack sweep`
-to --out. Finished cells in --out are not run again. With --results, rows and record become the headline figure.
+FNR is the share of frames and drones that were missed. --detector adds projection lines and both fused on the
+detections of a network: `trained` is trained first, on simulated sequences that are not in the table, in a quarter of
+an hour; `network` comes with the package; else a file (see `psotrack detect --detector`).
+
+Writes the tables, table4.md, and the files of `psotrack sweep` to --out. Finished cells in --out are not run again.
+With --results, rows and record become the headline figure.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -18,6 +24,9 @@ import pandas as pd
 
 from psotrack.errors import PsotrackError
 from psotrack.recordings.datasets import CALIBRATION
+from psotrack.settings import TrackSettings
+from psotrack.simulation import SimulationSettings, simulate
+from psotrack.support import progress_bar
 from psotrack.sweeps import grid, pivot, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -26,6 +35,10 @@ from _sequences import simulated_root
 
 HERE = Path(__file__).parent
 SIMULATED = ("S01_D2_A", "S02_D4_A", "S04_D10")
+#: Sequences on which `--detector trained` is trained; the last one validates.
+TRAINING = ("S03_D10_A", "S06_D6", "S11_D4", "S07_D8")
+TRAINING_FRAMES = 100
+EPOCHS, STEPS = 8, 200
 #: Title -> column, its factor, and decimals.
 TABLES = {
     "Mean error (mm)": ("mean_error_m", 1e3, 1),
@@ -65,6 +78,7 @@ def main() -> None:
         help="[default: methods.toml, beside this file]",
     )
     parser.add_argument("--out", type=Path, default=Path("table4"))
+    parser.add_argument("--detector", metavar="trained|network|FILE", help="also by a network's detections")
     parser.add_argument("--results", type=Path, help="write rows and record into this folder")
     options = parser.parse_args()
     run = _results.Run("table4")
@@ -72,6 +86,11 @@ def main() -> None:
         data = options.data or simulated_root(SIMULATED, Path("data"))
         methods = tomllib.loads(options.methods.read_text())
         rows = tracked({**methods, "sequences": at_hand(data)}, options.out, data)
+        if options.detector:
+            more = detected(methods, options.detector, options.out, data)
+            errors = [*rows.attrs["errors"], *more.attrs["errors"]]
+            rows = pd.concat([rows, more], ignore_index=True)
+            rows.attrs["errors"] = errors
         show(rows, options.out)
         if options.results:
             run.save(options.results, rows=rows[[name for name in KEPT if name in rows]])
@@ -87,6 +106,50 @@ def at_hand(data: Path) -> list[str]:
     if not found:
         sys.exit(f"table4: {data}: expected sequences in Simulated_Data or Real_Data, found none")
     return found
+
+
+def detected(methods: dict, detector: str, out: Path, data: Path) -> pd.DataFrame:
+    """The rows of methods that read detections, by those of a network instead of those that came with the sequences."""
+    model = str(trained(out)) if detector == "trained" else detector
+    root = out / "detected" / Path(detector).stem
+    for sequence in sorted(path.parent for path in data.glob(f"*/*/{CALIBRATION}")):
+        folder = root / sequence.parent.name / sequence.name
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in sequence.iterdir():
+            link = folder / path.name
+            if path.name != "dl_data" and not link.is_symlink():
+                link.symlink_to(path.resolve())
+        if not (folder / "dl_data").exists():
+            psotrack("detect", str(sequence), "--detector", model, "--out", str(folder / "dl_data"))
+    reading = {name: each for name, each in methods["methods"].items() if reads_detections(each)}
+    cells = {**methods, "methods": reading, "sequences": at_hand(root)}
+    rows = tracked(cells, out / "detected" / "runs" / Path(detector).stem, root)
+    rows["method"] += f" by {Path(detector).stem}"
+    return rows
+
+
+def reads_detections(method: dict) -> bool:
+    """Whether a method reads the detections that came with a sequence."""
+    return TrackSettings().changed(method).reads_detections
+
+
+def trained(out: Path) -> Path:
+    """The file of a network that is trained on sequences that are not in the table."""
+    model, root = out / "trained.model", out / "training"
+    settings = SimulationSettings(num_frames=TRAINING_FRAMES, scale=0.5, onboard=False)
+    for name in TRAINING:
+        if not (root / "Simulated_Data" / name).exists():
+            simulate(name, root, settings, report=progress_bar)
+    if not model.exists():
+        folders = [str(root / "Simulated_Data" / name) for name in TRAINING]
+        psotrack("train", *folders, "--out", str(model), "--epochs", f"{EPOCHS}", "--steps", f"{STEPS}")
+    return model
+
+
+def psotrack(*words: str) -> None:
+    """Run a command of psotrack; an error ends this program."""
+    print("$ psotrack", *words, flush=True)
+    subprocess.run([sys.executable, "-m", "psotrack", *words], check=True)
 
 
 def tracked(cells: dict, out: Path, data: Path) -> pd.DataFrame:

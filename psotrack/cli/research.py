@@ -49,15 +49,15 @@ class DetectOptions:
     """What is written.
 
     Attributes:
-        detector: YOLO network (v5 to v11) that was trained on drones, or the detector that an installed package adds
-            under NAME.
+        detector: "network", the network that comes with the package; a file of `psotrack train`; a YOLO network (v5 to
+            v11) that was trained on drones, as ONNX; or the detector that an installed package adds under NAME.
         blobs: write the blobs of foreground instead of a network's detections.
         silhouettes: compute and store the silhouettes, which `track` reads.
         masks: write the foreground of every frame at the size of the video, 0 to 255: as FOLDER/CAMERA/000000.png and
             so on, or as one video (.mp4, or .avi without loss).
     """
 
-    detector: Annotated[str | None, says(metavar="MODEL.onnx|NAME")] = None
+    detector: Annotated[str | None, says(metavar="network|FILE|NAME")] = None
     blobs: bool = False
     silhouettes: bool = False
     masks: Annotated[Path | None, says(metavar="FOLDER|FILE.mp4")] = None
@@ -92,6 +92,7 @@ def detect(
     \b
     Examples:
       psotrack detect my_lab --blobs
+      psotrack detect my_lab --detector network --confidence 0.4
       psotrack detect my_lab --detector drones.onnx --out boxes --size 1280 --confidence 0.4
       psotrack detect pictures/ --blobs --out boxes --min-blob 16
       psotrack detect my_lab --silhouettes --frames 100 --json -

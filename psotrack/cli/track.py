@@ -52,7 +52,7 @@ def track(
             )
         ),
     ],
-    detector: Annotated[str | None, says(metavar="MODEL.onnx|NAME")] = None,
+    detector: Annotated[str | None, says(metavar="network|FILE|NAME")] = None,
     detector_size: Annotated[int, says(rare=True)] = DETECTOR_SIZE,
     detector_layout: Annotated[Layout | None, says(rare=True)] = None,
     causal: bool = False,
@@ -74,14 +74,16 @@ def track(
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv --smooth
       psotrack track flight.psotrack --out again.csv
       psotrack track my_lab --method projection-lines --detections blobs
+      psotrack track my_lab --background network
       psotrack track my_lab --method fused --detector drones.onnx
       psotrack track my_lab --swarm joint --particles 100 --iterations 70 --save-config paper.toml
       psotrack track my_lab --config paper.toml --out again.csv
 
     Options:
         out: file of the tracks; it ends in .csv or .parquet. None: SEQ/results/tracks.csv.
-        detector: detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a
-            detector NAME that an installed package adds. Its detections are stored.
+        detector: detector, instead of --detections: "network", the network that comes with the package; a file of
+            `psotrack train`; a YOLO network (v5 to v11) that was trained on drones; or a detector NAME that an
+            installed package adds. Its detections are stored.
         detector_size: side of the network's square input, in pixels.
         detector_layout: layout of the network's output, as `psotrack detect --layout`. None: told by the output.
         causal: track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.

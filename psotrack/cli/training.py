@@ -12,7 +12,7 @@ from psotrack.cli.options import Cache, Jobs, cache_folder, compiled_folder
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
 from psotrack.foreground.learning.settings import TrainSettings
-from psotrack.foreground.silhouettes.settings import MODEL_SUFFIX
+from psotrack.foreground.network.names import MODEL_SUFFIX
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,8 @@ def train(
     The network sees a reduced frame and the learned background of its camera, and tells for each pixel whether the
     pixel shows a drone, and the boxes of the drones. After each epoch a line tells how well it does on the sequences
     for validation, OUT.png shows what it finds in them, and the state is kept: the same command goes on after an
-    interruption. OUT is the network of the best epoch; `track --background OUT` and `detect --detector OUT` use it.
+    interruption. OUT is the network of the best epoch; `track --background OUT` and `detect --detector OUT` use it. The
+    defaults take an hour on two processors.
 
     \b
     Examples:

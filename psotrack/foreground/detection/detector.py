@@ -31,7 +31,7 @@ from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.detection.settings import DetectorSettings, Layout
-from psotrack.foreground.silhouettes import MODEL_SUFFIX
+from psotrack.foreground.network.names import MODEL_SUFFIX, NETWORK, model_path
 from psotrack.recordings import (
     Detections,
     Recording,
@@ -145,14 +145,7 @@ class OnnxDetector:
         if np.abs(in_square[score >= self.settings.confidence]).max(initial=0.0) <= _LARGEST_SHARE:
             in_square *= size
         xyxy = (in_square - np.tile(start, 2)) / np.tile(scale, 2)
-        xyxy = np.clip(xyxy, 0, np.tile([bgr.shape[1], bgr.shape[0]], 2))
-        xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-        found = (xywh[:, 2:] > 0).all(axis=1) & (score >= self.settings.confidence)
-        xyxy, xywh, score = xyxy[found], xywh[found], np.minimum(score[found], 1.0)
-        # OpenCV sorts by score; for no boxes it returns an empty tuple.
-        kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), self.settings.confidence, self.settings.nms)
-        index = np.asarray(kept, np.int64).ravel()
-        return xyxy[index], score[index]
+        return usable_boxes(xyxy, np.minimum(score, 1.0), bgr.shape, self.settings)
 
     def _decode(self, output: Float[np.ndarray, "..."]) -> FoundBoxes:
         """Boxes (xyxy in pixels of the input, or in shares of its side) and their scores from the network's output."""
@@ -271,24 +264,48 @@ def _check_survives(model: Path, size: int, _modified_ns: int) -> None:
 
 
 def find_detector(name: str, settings: DetectorSettings) -> Detector:
-    """The detector that `--detector` names: an ONNX file, a file of `psotrack train`, or a plugin.
+    """The detector that `--detector` names: "network", a file of `psotrack train`, an ONNX file, or a plugin.
 
     Args:
-        name: path of such a file, or name of a plugin.
+        name: the network that comes with the package, the path of such a file, or name of a plugin.
         settings: settings of the detection.
 
     Raises:
         InputError: the file does not exist, or OpenCV cannot read it.
         SettingsError: there is neither such a file nor such a plugin.
     """
-    if Path(name).suffix == MODEL_SUFFIX:
+    if path := model_path(name):
         from psotrack.foreground.detection.network_detector import NetworkDetector
 
-        return NetworkDetector(name, settings)
+        return NetworkDetector(path, settings)
     if Path(name).suffix.lower() == ".onnx" or Path(name).exists():
         return OnnxDetector(name, settings)
-    built_in = ["MODEL.onnx (a file)", f"DRONES{MODEL_SUFFIX} (a file of `psotrack train`)"]
+    built_in = [NETWORK, "MODEL.onnx (a file)", f"DRONES{MODEL_SUFFIX} (a file of `psotrack train`)"]
     return make_plugin("detector", name, settings, interface=Detector, setting="detector", built_in=built_in)
+
+
+def usable_boxes(
+    xyxy: Float[np.ndarray, "boxes 4"],
+    score: Float[np.ndarray, "boxes"],
+    shape: tuple[int, ...],
+    settings: DetectorSettings,
+) -> FoundBoxes:
+    """Boxes within an image, and their scores, the highest first; of boxes of one drone only the best.
+
+    Args:
+        xyxy: boxes in pixels of the image.
+        score: their scores.
+        shape: height and width of the image, pixels.
+        settings: settings of the detection; `confidence` and `nms` are used.
+    """
+    xyxy = np.clip(xyxy, 0, [shape[1], shape[0]] * 2)
+    xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
+    found = (xywh[:, 2:] > 0).all(axis=1) & (score >= settings.confidence)
+    xyxy, xywh, score = xyxy[found], xywh[found], score[found]
+    # OpenCV sorts by score; for no boxes it returns an empty tuple.
+    kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), settings.confidence, settings.nms)
+    index = np.asarray(kept, np.int64).ravel()
+    return xyxy[index], score[index]
 
 
 def detect_drones(

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.foreground.detection.detector import FoundBoxes
+from psotrack.foreground.detection.detector import FoundBoxes, usable_boxes
 from psotrack.foreground.detection.settings import DetectorSettings
 from psotrack.foreground.network import findings, model_at
 from psotrack.foreground.silhouettes import ForegroundSettings, learned_mog2, learning_step, reduce_frame
@@ -59,9 +59,7 @@ class NetworkDetector:
         settings = self._reduction((width, height))
         image = reduce_frame(bgr, settings)
         _, boxes, confidence = findings(self._network, image, self._background, self.settings.confidence)
-        boxes = np.clip(boxes * settings.working_reduction, 0, np.tile([width, height], 2))
-        is_box = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
-        return boxes[is_box], confidence[is_box]
+        return usable_boxes(boxes * settings.working_reduction, confidence, bgr.shape, self.settings)
 
     def _reduction(self, image_size_wh: tuple[int, int]) -> ForegroundSettings:
         factor = max(1, math.ceil(max(image_size_wh) / self.settings.size))

@@ -15,11 +15,12 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError
+from psotrack.foreground.learning.steps import Batch
 from psotrack.foreground.learning.tracked import TrackedDrones
-from psotrack.foreground.learning.variations import Batch
+from psotrack.foreground.learning.variations import Part, varied
 from psotrack.foreground.silhouettes import (
     ForegroundSettings,
     Living,
@@ -40,7 +41,7 @@ MOST_DRONES = 16
 #: Foreground this share of a box's length beside the box of a track is that of its drone.
 _NEAR = 0.3
 #: Limits of the random scale of a part of a frame.
-_SCALE = (0.7, 1.5)
+_SCALE = (0.6, 1.7)
 #: Share of the parts of frames that are cut about a drone; the others are cut anywhere.
 _ABOUT_DRONES = 0.7
 
@@ -266,7 +267,7 @@ def _box_of(mask: UInt8[np.ndarray, "height width"], x0: int, y0: int) -> Float[
 def batches(
     parts: Sequence[Samples], size: int, count: int, generator: np.random.Generator
 ) -> Iterator[Batch]:
-    """Endless batches of parts of frames, at random places, scales and mirrored or not.
+    """Endless batches of parts of frames, at random places, scales and mirrored or not, with random changes.
 
     Args:
         parts: the samples of several videos.
@@ -275,26 +276,32 @@ def batches(
         generator: random numbers.
     """
     ends = np.cumsum([len(each) for each in parts])
+
+    def draw() -> Part:
+        number = int(generator.integers(ends[-1]))
+        which = int(np.searchsorted(ends, number, side="right"))
+        return _part(parts[which], number - int(ends[which]) + len(parts[which]), size, generator)
+
     while True:
-        chosen = [
-            _part(parts, int(number), ends, size, generator)
-            for number in generator.integers(ends[-1], size=count)
-        ]
-        image, background, covered, box_px, by_boxes = (np.stack(each) for each in zip(*chosen, strict=True))
-        counts = (covered == 0) | ~by_boxes[:, None, None]
-        yield Batch(image, background, covered, counts, box_px.astype(np.float32), ~by_boxes)
+        chosen = [varied(draw(), draw, generator) for _ in range(count)]
+        pixels = {
+            name: np.stack([np.asarray(getattr(each, name), np.uint8) for each in chosen])
+            for name in ("image", "background")
+        }
+        covered = np.stack([np.round(255 * each.covered).astype(np.uint8) for each in chosen])
+        counts = (covered == 0) | np.array([not each.by_boxes for each in chosen])[:, None, None]
+        box_px = np.stack([each.box_px for each in chosen]).astype(np.float32)
+        yield Batch(
+            **pixels,
+            covered=covered,
+            counts=counts,
+            box_px=box_px,
+            is_known=np.array([each.is_known for each in chosen]),
+        )
 
 
-def _part(
-    parts: Sequence[Samples],
-    number: int,
-    ends: Int[np.ndarray, "videos"],
-    size: int,
-    generator: np.random.Generator,
-) -> tuple[np.ndarray, ...]:
-    """A part of one frame: image, background, coverage and boxes, and whether the boxes are all that is known."""
-    which = int(np.searchsorted(ends, number, side="right"))
-    samples, index = parts[which], number - int(ends[which]) + len(parts[which])
+def _part(samples: Samples, index: int, size: int, generator: np.random.Generator) -> Part:
+    """A part of one frame."""
     height, width = samples.background.shape[:2]
     scale = float(np.exp(generator.uniform(*np.log(_SCALE))))
     side, boxes = size / scale, np.array(samples.box_px[index])
@@ -305,10 +312,8 @@ def _part(
     else:
         middle = generator.uniform(0, 1, 2) * (width, height)
     # Within the frame, where it is large enough.
-    low, high = (
-        np.minimum(side, (width, height)) / 2,
-        np.maximum((width, height) - np.array(side / 2), (np.array((width, height)) / 2)),
-    )
+    low = np.minimum(side, (width, height)) / 2
+    high = np.maximum((width, height) - np.array(side / 2), (np.array((width, height)) / 2))
     middle = np.clip(middle, low, high)
     mirror = -1.0 if generator.random() < 0.5 else 1.0
     # A point p of the frame is at scale * (p - middle) + size / 2; edges of pixels are at whole numbers.
@@ -316,18 +321,16 @@ def _part(
     start = size / 2 - turned @ middle
     pixels = np.column_stack([turned, start + (turned.sum(axis=1) - 1) / 2])
 
-    def cut(image: np.ndarray, border: int) -> np.ndarray:
-        return cv2.warpAffine(
-            np.ascontiguousarray(image), pixels, (size, size), flags=cv2.INTER_LINEAR, borderMode=border
-        )
+    def cut(image: np.ndarray, border: int) -> Float[np.ndarray, "..."]:
+        made = cv2.warpAffine(np.ascontiguousarray(image), pixels, (size, size), borderMode=border)
+        return np.asarray(made, np.float32)
 
     corners = boxes.reshape(-1, 2, 2) @ turned.T + start
     cut_boxes = np.clip(np.hstack([corners.min(axis=1), corners.max(axis=1)]), 0, size)
     area, whole = (np.prod(each[:, 2:] - each[:, :2], axis=1) for each in (cut_boxes, boxes * scale))
     # Less than a third of a drone at the border is no drone that can be told.
     cut_boxes[~(area > whole / 3)] = np.nan
-    image, background = (
-        cut(each, cv2.BORDER_REPLICATE) for each in (samples.image[index], samples.background)
-    )
-    covered = cut(samples.covered[index], cv2.BORDER_CONSTANT)
-    return image, background, covered, cut_boxes, np.array(samples.by_boxes)
+    image = cut(samples.image[index], cv2.BORDER_REPLICATE)
+    background = cut(samples.background, cv2.BORDER_REPLICATE)
+    covered = cut(samples.covered[index], cv2.BORDER_CONSTANT) / 255
+    return Part(image, background, covered, cut_boxes, samples.by_boxes, not samples.by_boxes)

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.foreground.learning.samples import Samples
-from psotrack.foreground.learning.steps import look
-from psotrack.foreground.learning.variations import Batch
+from psotrack.foreground.learning.steps import Batch, look
 from psotrack.foreground.network import USUAL_CONFIDENCE, Network, boxes_of, padded
 
 #: A box is a drone's from this intersection over union on.

@@ -33,8 +33,8 @@ class TrainSettings(msgspec.Struct, frozen=True):
     validation: tuple[str, ...] | None = None
     from_tracks: bool = False
     per_camera: Annotated[int, Meta(ge=2)] = 40
-    epochs: Annotated[int, Meta(ge=1)] = 40
-    steps: Annotated[int, Meta(ge=1)] = 200
+    epochs: Annotated[int, Meta(ge=1)] = 20
+    steps: Annotated[int, Meta(ge=1)] = 350
     batch: Annotated[int, Meta(ge=1)] = 16
     part_px: Annotated[int, Meta(ge=32, multiple_of=8)] = 192
     learning_rate: Annotated[float, Meta(gt=0)] = 2e-3

@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
-from psotrack.foreground.learning.loss import losses
-from psotrack.foreground.learning.variations import Batch, plain, varied
-from psotrack.foreground.network import Network, peaks_of, untrained
+from psotrack.foreground.learning.loss import Targets, losses
+from psotrack.foreground.network import Network, inputs_of, peaks_of, untrained
 from psotrack.support import as_written
 
 #: Largest norm of a gradient: of images without drones, or with many, it may be many times the usual one.
@@ -20,6 +21,28 @@ _LARGEST_GRADIENT = 5.0
 _WARM_UP = 0.05
 #: Share of each weight that a step takes away, as a multiple of the learning rate.
 _DECAY = 1e-4
+
+
+_Arrays = Array | np.ndarray
+
+
+class Batch(NamedTuple):
+    """Parts of frames of one size.
+
+    Attributes:
+        image, background: BGR; the background is of use where `is_known`.
+        covered: share of each pixel that drones cover, 0 to 255.
+        counts: whether `covered` is known.
+        box_px: xyxy of each drone, pixels; NaN for no drone.
+        is_known: whether the background is known.
+    """
+
+    image: UInt8[_Arrays, "images height width 3"]
+    background: UInt8[_Arrays, "images height width 3"]
+    covered: UInt8[_Arrays, "images height width"]
+    counts: Bool[_Arrays, "images height width"]
+    box_px: Float[_Arrays, "images drones 4"]
+    is_known: Bool[_Arrays, "images"]
 
 
 class State(NamedTuple):
@@ -36,7 +59,7 @@ class Teacher:
     Args:
         learning_rate: largest learning rate.
         steps: number of steps in all.
-        seed: seed of the first network and of all random changes.
+        seed: seed of the first network.
     """
 
     def __init__(self, learning_rate: float, steps: int, seed: int) -> None:
@@ -53,24 +76,17 @@ class Teacher:
 
     @as_written()
     @jax.numpy_dtype_promotion("standard")  # optax mixes types
-    def step(self, state: State, batch: Batch, number: int) -> tuple[State, float]:
-        """The state after one step down the gradient, and the loss before the step.
-
-        Args:
-            state: the state.
-            batch: parts of frames.
-            number: number of the step, which chooses the random changes.
-        """
-        key = jax.random.fold_in(jax.random.key(self._seed), number)
-        network, memory, loss = _step(state.network, state.memory, batch, key, self._optimiser)
+    def step(self, state: State, batch: Batch) -> tuple[State, float]:
+        """The state after one step down the gradient, and the loss before the step."""
+        network, memory, loss = _step(state.network, state.memory, batch, self._optimiser)
         return State(network, memory, state.best), float(loss)
 
 
 @eqx.filter_jit
 def _step(
-    network: Network, memory: Any, batch: Batch, key: Array, optimiser: optax.GradientTransformation
+    network: Network, memory: Any, batch: Batch, optimiser: optax.GradientTransformation
 ) -> tuple[Network, Any, Float[Array, ""]]:
-    inputs, targets = varied(key, batch)
+    inputs, targets = _shown(batch)
 
     def loss_of(network: Network) -> Float[Array, ""]:
         return losses(network(inputs), targets).total
@@ -78,6 +94,13 @@ def _step(
     loss, gradient = eqx.filter_value_and_grad(loss_of)(network)
     updates, memory = optimiser.update(gradient, memory, eqx.filter(network, eqx.is_array))
     return eqx.apply_updates(network, updates), memory, loss
+
+
+def _shown(batch: Batch) -> tuple[Float[Array, "images height width 6"], Targets]:
+    """Inputs and targets of a batch."""
+    image, background, covered, counts, box_px, is_known = map(jnp.asarray, batch)
+    inputs = inputs_of(image.astype(jnp.float32), background.astype(jnp.float32), is_known)
+    return inputs, Targets(covered.astype(jnp.float32) / 255, counts, box_px)
 
 
 @as_written()
@@ -88,6 +111,6 @@ def look(network: Network, batch: Batch) -> tuple[Array, Array, Array, Array]:
 
 @eqx.filter_jit
 def _look(network: Network, batch: Batch) -> tuple[Array, Array, Array, Array]:
-    inputs, targets = plain(batch)
+    inputs, targets = _shown(batch)
     found = network(inputs)
     return (losses(found, targets).total, *peaks_of(found))

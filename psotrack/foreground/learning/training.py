@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from psotrack.support import Report, atomic_write, digest_record, no_progress
 logger = logging.getLogger(__name__)
 
 #: Largest number of frames of a camera that validate.
-_VALIDATED = 8
+_VALIDATED = 4
 #: How the state of an unfinished training is named beside the model file.
 _STATE_SUFFIX = ".unfinished"
 
@@ -131,14 +132,16 @@ def train(
     unfinished = out.with_suffix(_STATE_SUFFIX)
     of = digest_record({"settings": msgspec.to_builtins(settings), "about": dict(about)})
     state, history = _resumed(unfinished, teacher.begin(), of)
-    with report("train", steps) as advance:
+    with report("train", steps) as advance, ThreadPoolExecutor(1) as ahead:
         advance(len(history) * settings.steps)
         while len(history) < settings.epochs and _since_best(history) < settings.patience:
             epoch, learned = len(history), 0.0
             generator = np.random.default_rng([settings.seed, epoch])
             coming = batches(training, settings.part_px, settings.batch, generator)
-            for step in range(settings.steps):
-                state, loss = teacher.step(state, next(coming), epoch * settings.steps + step)
+            made = [ahead.submit(next, coming)]
+            for _ in range(settings.steps):
+                made.append(ahead.submit(next, coming))
+                state, loss = teacher.step(state, made.pop(0).result())
                 learned += loss / settings.steps
                 advance(1)
             if not math.isfinite(learned):

@@ -15,14 +15,13 @@ from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
 from .masks import masks_out, write_masks
 from .repeated_frames import FrameChanges, repeated_frames
-from .settings import MODEL_SUFFIX, ForegroundSettings, Shadows, SilhouetteSettings, check_whole
+from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import SEAL_FILE, Task, ignored_pixels, is_whole, reduced_shape
 from .summed_area import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
 __all__ = [
     "LOW_BITS",
-    "MODEL_SUFFIX",
     "SEAL_FILE",
     "BackgroundModel",
     "CacheEntry",

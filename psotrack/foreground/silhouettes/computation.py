@@ -15,12 +15,12 @@ import numpy as np
 import zarr
 
 from psotrack.errors import InputError, SettingsError, errors_name
+from psotrack.foreground.network.names import NETWORK, model_path
 from psotrack.foreground.silhouettes.foreground import BackgroundModel, Mog2
 from psotrack.foreground.silhouettes.frames import FramesOfInstants, Silhouettes
 from psotrack.foreground.silhouettes.living_background import Living
 from psotrack.foreground.silhouettes.settings import (
     LIVING,
-    MODEL_SUFFIX,
     MOG2,
     ForegroundSettings,
     SilhouetteSettings,
@@ -197,23 +197,28 @@ def stored_silhouettes(
 
 
 def find_background(name: str, settings: ForegroundSettings) -> BackgroundModel:
-    """The background model of a name: "mog2", "living", a file of `psotrack train`, or a plugin.
+    """The background model of a name: "mog2", "living", "network", a file of `psotrack train`, or a plugin.
 
     Raises:
         InputError: the file cannot be read, or is no network of this version.
         SettingsError: there is no background model of this name.
     """
-    if Path(name).suffix == MODEL_SUFFIX:
+    if path := model_path(name):
         from psotrack.foreground.network import model_at
         from psotrack.foreground.silhouettes.network_background import NetworkBackground
 
-        model_at(Path(name))
-        return NetworkBackground(settings, Path(name))
+        model_at(path)
+        return NetworkBackground(settings, path)
     built_in: dict[str, type[Mog2 | Living]] = {MOG2: Mog2, LIVING: Living}
     if name in built_in:
         return built_in[name](settings)
     return make_plugin(
-        "background", name, settings, interface=BackgroundModel, setting="background", built_in=list(built_in)
+        "background",
+        name,
+        settings,
+        interface=BackgroundModel,
+        setting="background",
+        built_in=[*built_in, NETWORK],
     )
 
 

@@ -11,8 +11,6 @@ from msgspec import Meta
 from psotrack.errors import SettingsError, check_positive
 from psotrack.support import Share, check_types
 
-#: How files of trained networks end (`psotrack train`).
-MODEL_SUFFIX = ".model"
 #: Names of the background models of this package.
 MOG2, LIVING = "mog2", "living"
 
@@ -33,8 +31,8 @@ _LEAST_DRONE_CELLS = 6
 _LEAST_USUAL_PX = 24
 #: Speckle: blobs narrower than this share of a drone's width; a blob has 4 pixels at least.
 _SPECKLE, _LEAST_BLOB_PX = 0.2, 4
-#: Smallest blob of the background model "living" where the drones' size is not given, pixels: a distant drone of 5 x 2
-#: pixels. The model itself tells speckle from objects, down to this size (`object_blobs`).
+#: Smallest blob where the drones' size is not given, pixels: a distant drone of 5 x 2 pixels. All background models but
+#: "mog2" tell speckle from objects themselves.
 _LEAST_OBJECT_PX = 9
 
 #: Settings that the background model "living" does not use; only this model uses `first_look`.
@@ -107,7 +105,8 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
     """Settings of silhouettes.
 
     Attributes:
-        background: name of the background model: "living", "mog2" or a plugin.
+        background: name of the background model: "living", "mog2", "network" (the network that comes with the
+            package), the path of a file of `psotrack train`, or a plugin.
         drone_px: width of the smallest drone in the images, pixels; sets the next three where they are None. None: the
             longer side of the images / 48, which is 40 pixels in an image of 1920; smaller drones are found as well.
         reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`;
@@ -116,7 +115,7 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
             image; 1 is the full image. None: from `drone_px`; where the rig says that drones of 0.3 m are wide in the
             images (see `usual_drone_px`), the reduction.
         min_blob_px: 8-connected blobs with fewer pixels of the full image are removed; None: from
-            `drone_px`; 9 for "living" without `drone_px`.
+            `drone_px`; 9 without `drone_px`, except for "mog2".
         num_learning_frames: largest number of frames, spread over the video, from which the background is learned.
         learning_rate: learning rate per frame in the second pass of "mog2", in [0, 1]; 0 keeps the learned background.
         var_threshold: squared Mahalanobis distance from the background beyond which a pixel is foreground, for "mog2".
@@ -129,7 +128,7 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         SettingsError: a value is out of range, or belongs to another background model.
     """
 
-    background: Annotated[str, Meta(extra={"metavar": "living|mog2|NAME"})] = LIVING
+    background: Annotated[str, Meta(extra={"metavar": "living|mog2|network|NAME"})] = LIVING
     drone_px: float | None = None
     reduction: _OneOrMore | None = None
     working_reduction: _OneOrMore | None = None
@@ -175,7 +174,7 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         least_px = self.min_blob_px
         if least_px is None:
             speckle_px = max(_LEAST_BLOB_PX, round((_SPECKLE * across_px) ** 2))
-            least_px = _LEAST_OBJECT_PX if self.drone_px is None and self.background == LIVING else speckle_px
+            least_px = _LEAST_OBJECT_PX if self.drone_px is None and self.background != MOG2 else speckle_px
         common = {name: getattr(self, name) for name in _CommonSettings.__struct_fields__}
         return ForegroundSettings(
             working_reduction=working, reduction=reduction, min_blob_px=least_px, **common

@@ -1,0 +1,231 @@
+"""How well background models and detectors find drones, and how well the swarm tracks by each of them.
+
+    python experiments/accuracy/accuracy.py foreground --data data --real REAL
+    python experiments/accuracy/accuracy.py foreground --data data --methods living lab.model --only calm
+
+Cases: four simulated drones in a calm room, in restless surroundings, that hover at first, that stay where they are,
+before cameras that tremble, in light that flickers; three in a hall; with --rendered FOLDER a sequence of
+`experiments/rendered.py`; with --real clips of drones and birds before cameras that stand still. None of them is in the
+training of the package's network. A blob or a box is a drone's if its middle is in the drone's box. With --detector
+MODEL.onnx the clips are also searched by a network of others (`psotrack detect`).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+from reference import _figures, psotrack
+
+from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
+from psotrack.foreground.learning.samples import gather
+from psotrack.foreground.silhouettes import (
+    ForegroundSettings,
+    SilhouetteSettings,
+    find_background,
+    learning_step,
+    scaled_settings,
+)
+from psotrack.recordings import VideoInfo, open_video, read_frames
+from psotrack.recordings.datasets import open_recording
+from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
+from psotrack.support import progress_bar
+from psotrack.trajectories import read_trajectories
+
+METHODS = ("mog2", "living", "network")
+#: Places of the four drones of S02_D4_A that stay, metres, and how far away the second place is of those that move.
+PLACES_M = ((1.2, 0.9, 1.6), (-1.2, 0.9, 1.2), (1.2, -0.9, 1.9), (-1.2, -0.9, 1.5))
+AWAY_M = (0.0, -0.7, 0.3)
+#: Name of each simulated case: its preset, and changes of it.
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "calm": ("S02_D4_A", {}),
+    "restless": ("S02_D4_A", dict(RESTLESS)),
+    "hovers at first": ("S02_D4_A", {}),
+    "stays": ("S02_D4_A", {}),
+    "trembles": ("S02_D4_A", {}),
+    "flickers": ("S02_D4_A", {"imaging.exposure": [0.75, 1.33], "imaging.exposure_period_s": 0.37}),
+    "hall": ("S12_D3", {}),
+}
+for number, place_m in enumerate(PLACES_M):
+    there_m = [a + b for a, b in zip(place_m, AWAY_M, strict=True)]
+    moves = {"kind": "waypoints", "points_m": [place_m, there_m], "speed_m_s": 0.6, "hover_s": 4.0}
+    CASES["hovers at first"][1][f"drones[{number}].flight"] = moves
+    stays = {"kind": "orbit", "centre_m": place_m, "radius_m": [0.0, 0.0], "period_s": 10.0}
+    CASES["stays"][1][f"drones[{number}].flight"] = stays
+#: Largest tremble, pixels of a frame half as large as usual.
+TREMBLE_PX = 2.0
+#: Frames of each camera, and cameras, whose pixels and blobs are compared.
+PER_CAMERA, CAMERAS = 10, 4
+CLIPS = "DroneDetectionThesis/Drone-detection-dataset"
+STILL = [f"V_DRONE_{number:03d}" for number in (4, 20, 30, 50, 60, 70, 80, 90, 100)] + [
+    "V_BIRD_022",
+    "V_BIRD_040",
+]
+#: Pixels by which the box of a clip is too small at most.
+MARGIN_PX = 3
+
+
+def case(name: str, data: Path) -> Path:
+    """The folder of a simulated case, which is made if it is missing."""
+    preset, changes = CASES[name]
+    root = data / "foreground" / name.replace(" ", "_")
+    folder = root / "Simulated_Data" / preset
+    if not folder.exists():
+        recipe = change_scenario(scenario(preset), changes)
+        settings = SimulationSettings(num_frames=200, scale=0.5, seed=7, onboard=False)
+        simulate(recipe, root, settings, report=progress_bar)
+        if name == "trembles":
+            for number, path in enumerate(sorted(folder.glob("*.avi"))):
+                tremble(path, np.random.default_rng(number))
+    return folder
+
+
+def tremble(path: Path, random: np.random.Generator) -> None:
+    """Move each frame of a video by up to 2 pixels."""
+    video = open_video(path)
+    frames = [np.asarray(frame) for frame in read_frames(video)]
+    code = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), code, video.fps, video.image_size_wh)
+    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 95)
+    for frame in frames:
+        by = np.column_stack([np.eye(2), random.uniform(-TREMBLE_PX, TREMBLE_PX, 2)])
+        writer.write(cv2.warpAffine(frame, by, video.image_size_wh, borderMode=cv2.BORDER_REPLICATE))
+    writer.release()
+
+
+def tracked(name: str, method: str, folder: Path, data: Path) -> dict[str, Any]:
+    """A sequence by a background model: pixels and blobs beside the masks, and tracks beside the truth."""
+    tracks = data / "foreground" / "tracks" / f"{name}-{Path(method).stem}.csv".replace(" ", "_")
+    tracks.parent.mkdir(parents=True, exist_ok=True)
+    where = ("--out", str(tracks), "--cache", str(data / "silhouettes"), "--force")
+    refused = psotrack("track", str(folder), "--background", method, *where)
+    recording = open_recording(folder)
+    row = {"case": name, "method": method, **_pixels(recording.usable(), method, data)}
+    if refused:
+        return {**row, "tracks": 0, "missed": 1.0}
+    found = read_trajectories(tracks)
+    assert recording.truth is not None
+    figures = _figures(found, recording.truth, 0.5)
+    kept = ("mean_mm", "centred_mm", "missed", "switches", "false_tracks")
+    return {**row, "tracks": found.num_drones, **{each: figures[each] for each in kept}}
+
+
+def _pixels(recording: Any, method: str, data: Path) -> dict[str, float]:
+    chosen = SilhouetteSettings(background=method)
+    settings = scaled_settings(chosen, recording)
+    samples = gather(recording, settings, per_camera=PER_CAMERA, cache=data / "silhouettes", jobs=2)
+    counts, blobs = np.zeros(3), np.zeros(4)
+    for (_, video), shown in list(zip(recording.videos.items(), samples, strict=True))[:CAMERAS]:
+        frames = np.unique(np.linspace(0, video.num_frames - 1, PER_CAMERA).round().astype(int)).tolist()
+        masks = [mask for number, mask in enumerate(_foreground(method, settings, video)) if number in frames]
+        for mask, covered, truth in zip(masks, shown.covered, shown.box_px, strict=True):
+            if mask is None:
+                mask = np.zeros(covered.shape, np.uint8)
+            scale = covered.shape[0] / mask.shape[0]
+            mask = cv2.resize(mask, covered.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            found, drawn = mask >= 128, covered >= 128
+            counts += (found & drawn).sum(), found.sum(), drawn.sum()
+            blobs += _matched(_blobs(mask), truth[np.isfinite(truth[:, 0])], 1.0 * scale)
+    return {
+        "pixel_f": 2 * counts[0] / max(counts[1:].sum(), 1),
+        "recall": blobs[0] / max(blobs[1], 1),
+        "false_per_frame": blobs[2] / blobs[3],
+    }
+
+
+def _foreground(method: str, settings: ForegroundSettings, video: VideoInfo) -> Iterator[np.ndarray | None]:
+    model = find_background(method, settings)
+    yield from model.foreground(
+        read_frames(video, learning_step(video.num_frames, settings)), read_frames(video)
+    )
+
+
+def _blobs(mask: np.ndarray) -> np.ndarray:
+    boxes = cv2.connectedComponentsWithStats((mask >= 128).astype(np.uint8))[2][1:, :4].astype(float)
+    return np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]])
+
+
+def _matched(boxes: np.ndarray, truth: np.ndarray, margin_px: float) -> tuple[int, int, int, int]:
+    """Drones that have a box, drones, boxes that are no drone's, and one frame."""
+    middle = (boxes[:, None, :2] + boxes[:, None, 2:]) / 2
+    inside = ((middle >= truth[:, :2] - margin_px) & (middle <= truth[:, 2:] + margin_px)).all(axis=-1)
+    return int(inside.any(axis=0).sum()), len(truth), int((~inside.any(axis=1)).sum()), 1
+
+
+def clip(name: str, method: str, confidence: float, real: Path) -> dict[str, Any]:
+    """A clip by a background model, or by the boxes of a detector with a least confidence."""
+    from mcos_decoder import load_groundtruth  # pip install mcos-decoder
+
+    path = real / CLIPS / "Data" / "Video_V" / f"{name}.mp4"
+    video = open_video(path)
+    labels = load_groundtruth(str(path.with_name(f"{name}_LABELS.mat")))
+    labels = labels[max(len(labels) - video.num_frames, 0) :]
+    total = np.zeros(4)
+    if confidence:
+        detector = find_detector(method, DetectorSettings(size=640, confidence=confidence))
+        told = detect_drones(detector, name, video)
+        found = (told.in_frame(number).xyxy for number in range(video.num_frames))
+    else:
+        settings = ForegroundSettings(reduction=1, working_reduction=1, min_blob_px=9)
+        masks = _foreground(method, settings, video)
+        found = (np.zeros((0, 4)) if mask is None else _blobs(mask) for mask in masks)
+    for boxes, label in zip(found, labels, strict=False):
+        box = np.zeros((0, 4)) if label is None or "BIRD" in name else np.array([label], float)
+        total += _matched(boxes, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]), MARGIN_PX)
+    shown = f"{method} boxes at {confidence}" if confidence else method
+    counts = dict(zip(("found", "drones", "false", "frames"), total.astype(int).tolist(), strict=True))
+    return {"case": name, "method": shown, **counts}
+
+
+def add_options(options: argparse.ArgumentParser) -> None:
+    """Options of this study."""
+    options.add_argument("--methods", nargs="+", default=METHODS, help="background models")
+    options.add_argument("--only", nargs="+", default=[""], help="cases whose names begin so [default: all]")
+    options.add_argument("--rendered", type=Path, help="a sequence of experiments/rendered.py")
+    options.add_argument("--detector", help="an ONNX file of others, for the clips")
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Name and function of each row."""
+
+    def is_chosen(name: str) -> bool:
+        return any(name.startswith(each) for each in options.only)
+
+    folders: dict[str, Callable[[], Path]] = {name: partial(case, name, options.data) for name in CASES}
+    if options.rendered is not None:
+        folders["rendered"] = lambda: options.rendered
+    for name, folder in folders.items():
+        for method in options.methods if is_chosen(name) else ():
+            yield f"{name}:{method}", partial(_tracked, name, method, folder, options.data)
+    if options.real is None:
+        return
+    networks = [each for each in options.methods if each not in ("mog2", "living")]
+    searches = [(each, 0.0) for each in options.methods]
+    searches += [(each, confidence) for each in networks for confidence in (0.2, 0.3, 0.4, 0.5)]
+    searches += [(options.detector, 0.1)] if options.detector else []
+    for name in filter(is_chosen, STILL):
+        for method, confidence in searches:
+            yield f"{name}:{method}:{confidence}", partial(clip, name, method, confidence, options.real)
+
+
+def _tracked(name: str, method: str, folder: Callable[[], Path], data: Path) -> dict[str, Any]:
+    return tracked(name, method, folder(), data)
+
+
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print the sequences, and the clips all together."""
+    settings: dict[str, Any] = {"float_format": "{:.3f}".format, "na_rep": "-"}
+    if "pixel_f" in table:
+        sequences = table[table.pixel_f.notna()].dropna(axis=1, how="all")
+        print(sequences.to_string(index=False, **settings))
+    if "found" in table:
+        clips = table[table.found.notna()].groupby("method")[["found", "drones", "false", "frames"]].sum()
+        clips["recall"] = clips.found / clips.drones
+        clips["false_per_frame"] = clips["false"] / clips.frames
+        print(clips.to_string(**settings))
