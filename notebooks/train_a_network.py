@@ -35,11 +35,12 @@ TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that ever
 NUM_FRAMES = 20 if TINY else 75
 SCALE = 0.25
 TRAINING = TrainSettings(
-    epochs=2 if TINY else 6,
-    steps=3 if TINY else 80,
+    epochs=2 if TINY else 10,
+    steps=3 if TINY else 100,
     batch=4 if TINY else 8,
     part_px=64 if TINY else 128,
     per_camera=5 if TINY else 20,
+    learning_rate=4e-3,
 )
 SILHOUETTES = {"silhouettes.reduction": 1, "silhouettes.working_reduction": 1}
 DATA = Path("data", "train_tiny" if TINY else "train")
