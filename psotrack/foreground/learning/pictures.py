@@ -46,10 +46,13 @@ def draw_findings(
         losses.plot(epochs, [each["learned"] for each in history], label="loss, training")
         losses.plot(epochs, [each["loss"] for each in history], label="loss, validation")
         losses.set_yscale("log")
-        for name in ("pixel_f", "recall", "false_per_frame"):
+        for name in ("pixel_f", "recall"):
             shares.plot(epochs, [each[name] for each in history], label=name.replace("_", " "))
-        shares.set(xlabel="epoch", ylim=(0, 2))
-        for axis in (losses, shares):
-            axis.legend()
+        shares.set(xlabel="epoch", ylim=(0, 1))
+        false = shares.twinx()
+        per_frame = [each["false_per_frame"] for each in history]
+        false.plot(epochs, per_frame, color=COLOURS[3], linestyle=":", label="false boxes a frame (right)")
+        for axis, place in ((losses, "upper right"), (shares, "lower left"), (false, "lower right")):
+            axis.legend(loc=place, fontsize=7)
 
     save_figure(out, (16, 4), draw, force=True)
