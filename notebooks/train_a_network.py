@@ -22,7 +22,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from IPython.display import Image
 
 import psotrack as pt
 from psotrack.foreground.learning import TrainSettings, train_on_sequences
@@ -70,8 +69,8 @@ model = train_on_sequences(folders, model_path, TRAINING, cache=DATA / "cache", 
 stored = [
     each for folder in sorted((DATA / "cache" / "samples").iterdir()) for each in Samples.load_all(folder)
 ]
-batch = next(batches(stored, TRAINING.part_px, 12, np.random.default_rng(1)))
-figure, axes = plt.subplots(4, 9, figsize=(11, 5), layout="constrained")
+batch = next(batches(stored, TRAINING.part_px, 6, np.random.default_rng(1)))
+figure, axes = plt.subplots(2, 9, figsize=(11, 2.6), layout="constrained")
 for index, (shown, background, mask) in enumerate(zip(*[iter(axes.flat)] * 3, strict=True)):
     shown.imshow(batch.image[index][..., ::-1])
     background.imshow(batch.background[index][..., ::-1])
@@ -88,7 +87,10 @@ for axis in axes.flat:
 # probability below.
 
 # %%
-Image(model_path.with_suffix(".png"))
+figure = plt.figure(figsize=(11, 2.75), dpi=110)
+figure.add_axes((0, 0, 1, 1), frameon=False, xticks=[], yticks=[]).imshow(
+    plt.imread(model_path.with_suffix(".png"))
+)
 
 # %%
 pd.DataFrame(model.card["epochs"]).round(3)
