@@ -5,7 +5,7 @@
 The sequences are simulated if missing, half as large as usual, in DATA/network. Each has the cameras and paths of a
 preset, and random exposure, noise, compression, plants, screens, people and lamps. Drones for training have random
 shapes. Sequences for validation have the package's drones, and cameras and paths of presets that are not in training.
-Writes DATA/network/drones.model, and a picture of what it finds.
+Writes DATA/network/drones.model, and a picture of what it finds. Further options are those of `psotrack train`.
 """
 
 from __future__ import annotations

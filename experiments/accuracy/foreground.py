@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-from reference import _figures, psotrack
+from reference import GATE_M, figures_of, psotrack
 
 from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
 from psotrack.foreground.learning.samples import gather
@@ -99,8 +99,9 @@ def tremble(path: Path, random: np.random.Generator) -> None:
     writer.release()
 
 
-def tracked(name: str, method: str, folder: Path, data: Path) -> dict[str, Any]:
+def tracked(name: str, method: str, made: Callable[[], Path], data: Path) -> dict[str, Any]:
     """A sequence by a background model: pixels and blobs beside the masks, and tracks beside the truth."""
+    folder = made()
     tracks = data / "foreground" / "tracks" / f"{name}-{Path(method).stem}.csv".replace(" ", "_")
     tracks.parent.mkdir(parents=True, exist_ok=True)
     where = ("--out", str(tracks), "--cache", str(data / "silhouettes"), "--force")
@@ -111,7 +112,7 @@ def tracked(name: str, method: str, folder: Path, data: Path) -> dict[str, Any]:
         return {**row, "tracks": 0, "missed": 1.0}
     found = read_trajectories(tracks)
     assert recording.truth is not None
-    figures = _figures(found, recording.truth, 0.5)
+    figures = figures_of(found, recording.truth, GATE_M)
     kept = ("mean_mm", "centred_mm", "missed", "switches", "false_tracks")
     return {**row, "tracks": found.num_drones, **{each: figures[each] for each in kept}}
 
@@ -127,11 +128,10 @@ def _pixels(recording: Any, method: str, data: Path) -> dict[str, float]:
         for mask, covered, truth in zip(masks, shown.covered, shown.box_px, strict=True):
             if mask is None:
                 mask = np.zeros(covered.shape, np.uint8)
-            scale = covered.shape[0] / mask.shape[0]
             mask = cv2.resize(mask, covered.shape[::-1], interpolation=cv2.INTER_LINEAR)
             found, drawn = mask >= 128, covered >= 128
             counts += (found & drawn).sum(), found.sum(), drawn.sum()
-            blobs += _matched(_blobs(mask), truth[np.isfinite(truth[:, 0])], 1.0 * scale)
+            blobs += _matched(_blobs(mask), truth[np.isfinite(truth[:, 0])], margin_px=1)
     return {
         "pixel_f": 2 * counts[0] / max(counts[1:].sum(), 1),
         "recall": blobs[0] / max(blobs[1], 1),
@@ -151,7 +151,7 @@ def _blobs(mask: np.ndarray) -> np.ndarray:
     return np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]])
 
 
-def _matched(boxes: np.ndarray, truth: np.ndarray, margin_px: float) -> tuple[int, int, int, int]:
+def _matched(boxes: np.ndarray, truth: np.ndarray, margin_px: int) -> tuple[int, int, int, int]:
     """Drones that have a box, drones, boxes that are no drone's, and one frame."""
     middle = (boxes[:, None, :2] + boxes[:, None, 2:]) / 2
     inside = ((middle >= truth[:, :2] - margin_px) & (middle <= truth[:, 2:] + margin_px)).all(axis=-1)
@@ -202,7 +202,7 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[s
         folders["rendered"] = lambda: options.rendered
     for name, folder in folders.items():
         for method in options.methods if is_chosen(name) else ():
-            yield f"{name}:{method}", partial(_tracked, name, method, folder, options.data)
+            yield f"{name}:{method}", partial(tracked, name, method, folder, options.data)
     if options.real is None:
         return
     networks = [each for each in options.methods if each not in ("mog2", "living")]
@@ -212,10 +212,6 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[s
     for name in filter(is_chosen, STILL):
         for method, confidence in searches:
             yield f"{name}:{method}:{confidence}", partial(clip, name, method, confidence, options.real)
-
-
-def _tracked(name: str, method: str, folder: Callable[[], Path], data: Path) -> dict[str, Any]:
-    return tracked(name, method, folder(), data)
 
 
 def show(table: pd.DataFrame, options: argparse.Namespace) -> None:

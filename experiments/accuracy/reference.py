@@ -144,7 +144,7 @@ def row(name: str, method: str, flight: Flight, data: Path) -> dict[str, Any]:
     found = read_trajectories(tracks)
     truth = open_recording(flight.sequence).truth if flight.truth is None else flight.truth
     there = {"flight": name, "method": method, "tracks": found.num_drones, **_presence(found)}
-    figures = {} if truth is None else _figures(found, truth, flight.gate_m)
+    figures = {} if truth is None else figures_of(found, truth, flight.gate_m)
     seconds = {f"{stage}_s": record["seconds"].get(stage) for stage in STAGES}
     return there | figures | seconds
 
@@ -156,7 +156,8 @@ def _presence(found: Trajectories) -> dict[str, float]:
     return {"tracked_per_frame": float(tracked.sum() / len(tracked)), "fitness": float(np.nanmean(fitness))}
 
 
-def _figures(found: Trajectories, truth: Trajectories, gate_m: float) -> dict[str, Any]:
+def figures_of(found: Trajectories, truth: Trajectories, gate_m: float) -> dict[str, Any]:
+    """Errors beside a reference, and false tracks (see `false_tracks`)."""
     errors = evaluate(found, truth).to_dict()
     mean_m, centred_m = errors["mean_error_m"], errors["offset_removed_mean_error_m"]
     return {

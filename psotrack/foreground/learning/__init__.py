@@ -1,9 +1,9 @@
 """A network that finds drones, trained on recordings whose drones are known.
 
-In: recordings with masks or tracks of their drones, or a YOLO data set. Out: a model file, which serves as background
-model (the foreground of a video) and as detector (boxes), and is written as ONNX. `network` is the network, `loss` what
-it learns, `samples` the frames that it learns from, `variations` their random changes, `training` the training,
-`model_file` its file, `serving` its use. Other rooms may use every name in `__init__.pyi`.
+In: recordings with masks or tracks of their drones, or a YOLO data set. Out: a model file (see
+`psotrack.foreground.network`), which serves as background model and as detector. `samples` are the frames that the
+network learns from, `variations` their random changes, `loss` what it learns, `steps` one step, `training` the whole.
+Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

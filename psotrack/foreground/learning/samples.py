@@ -197,11 +197,9 @@ def _drawn(
     task: _Task, shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "samples height width"], Float[np.ndarray, "samples drones 4"]]:
     """Coverage and boxes of the drones by their masks."""
-    factor, boxes = task.settings.working_reduction, np.full((len(task.frames), MOST_DRONES, 4), np.nan)
-    covered, camera = (
-        np.zeros((len(task.frames), *shape), np.float32),
-        task.video.path.stem.removesuffix("_s"),
-    )
+    factor, camera = task.settings.working_reduction, task.video.path.stem.removesuffix("_s")
+    boxes = np.full((len(task.frames), MOST_DRONES, 4), np.nan)
+    covered = np.zeros((len(task.frames), *shape), np.float32)
     with zipfile.ZipFile(task.masks) as archive:
         start = f"{camera}/dron"
         drones = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith(start)})
@@ -239,10 +237,8 @@ def _found(
     for number, mask in enumerate(masks):
         if number not in chosen:
             continue
-        index, shown = (
-            len(covered),
-            np.full(reduced_shape(video.image_size_wh, settings.working_reduction), np.nan),
-        )
+        index = len(covered)
+        shown = np.full(reduced_shape(video.image_size_wh, settings.working_reduction), np.nan)
         if mask is not None:
             shown = np.zeros(mask.shape)
             for drone, box in enumerate(chosen[number][:MOST_DRONES]):
@@ -284,20 +280,16 @@ def batches(
 
     while True:
         chosen = [varied(draw(), draw, generator) for _ in range(count)]
-        pixels = {
-            name: np.stack([np.asarray(getattr(each, name), np.uint8) for each in chosen])
+        image, background = (
+            np.stack([getattr(each, name).astype(np.uint8) for each in chosen])
             for name in ("image", "background")
-        }
-        covered = np.stack([np.round(255 * each.covered).astype(np.uint8) for each in chosen])
-        counts = (covered == 0) | np.array([not each.by_boxes for each in chosen])[:, None, None]
-        box_px = np.stack([each.box_px for each in chosen]).astype(np.float32)
-        yield Batch(
-            **pixels,
-            covered=covered,
-            counts=counts,
-            box_px=box_px,
-            is_known=np.array([each.is_known for each in chosen]),
         )
+        covered = np.stack([np.round(255 * each.covered).astype(np.uint8) for each in chosen])
+        by_boxes = np.array([each.by_boxes for each in chosen])
+        counts = (covered == 0) | ~by_boxes[:, None, None]
+        box_px = np.stack([each.box_px for each in chosen]).astype(np.float32)
+        is_known = np.array([each.is_known for each in chosen])
+        yield Batch(image, background, covered, counts, box_px, is_known)
 
 
 def _part(samples: Samples, index: int, size: int, generator: np.random.Generator) -> Part:
