@@ -77,10 +77,12 @@ def bright_squares(layout: str, size: int) -> bytes:
     Args:
         layout: layout of the output: "v5", "v8", "v10" (the first 300 boxes only), "suppressed" (the same of class 0),
             "swapped" (class before score), "middles" (three classes), "shares" ("v8" in shares of the side), "oriented"
-            ("v8" with angles), "logits" ("v8" without the sigmoid), or "none" (one that the detector does not know).
+            ("v8" with angles), "yolox" (of an image BGR in [0, 255]), "logits" ("v8" without the sigmoid), or "none" (one that the detector does not know).
         size: side of the input image, pixels.
     """
-    cells = (size - SIDE) // STRIDE + 1
+    # The boxes of YOLOX may begin in each cell.
+    beyond = SIDE - STRIDE if layout == "yolox" else 0
+    cells = (size + beyond - SIDE) // STRIDE + 1
     n = cells * cells
     row, column = np.divmod(np.arange(n), cells)
     x0, y0 = STRIDE * column, STRIDE * row
@@ -102,9 +104,14 @@ def bright_squares(layout: str, size: int) -> bytes:
     }
     if layout == "shares":
         tensors["boxes"] /= size
-    kernel_shape, strides = [SIDE, SIDE], [STRIDE, STRIDE]
+    if layout == "yolox":
+        tensors["kernel"] /= 255
+        tensors["boxes"] = np.tile(np.float32([2, 2, np.log(4), np.log(4)])[:, None], n)[None]
+        rest = (size // 16) ** 2 + (size // 32) ** 2
+        tensors["rest"] = np.tile(np.float32([0, 0, -1, -1, 0, 1])[:, None], rest)[None]
+    kernel_shape, strides, pads = [SIDE, SIDE], [STRIDE, STRIDE], [0, 0, beyond, beyond]
     nodes = [
-        _node("Conv", ["images", "kernel", "bias"], "sums", kernel_shape=kernel_shape, strides=strides),
+        _node("Conv", ["images", "kernel", "bias"], "sums", kernel_shape=kernel_shape, strides=strides, pads=pads),
         _node("Identity" if layout == "logits" else "Sigmoid", ["sums"], "map"),
         _node("Reshape", ["map", "flat"], "scores"),
     ]
@@ -123,5 +130,8 @@ def bright_squares(layout: str, size: int) -> bytes:
     if layout == "v10":
         chosen, n = "chosen", 300
         nodes.append(_node("Gather", ["columns", "first"], chosen, axis=2))
+    if layout == "yolox":
+        chosen, n = "all", n + rest
+        nodes.append(_node("Concat", ["columns", "rest"], chosen, axis=2))
     nodes.append(_node("Transpose", [chosen], "output", perm=[0, 2, 1]))
     return model(nodes, tensors, shape, (1, n, 6))

@@ -7,7 +7,7 @@ Cases: four simulated drones in a calm room, in restless surroundings, that hove
 before cameras that tremble, in light that flickers; three in a hall; with --rendered FOLDER a sequence of
 `experiments/rendered.py`; with --real clips of drones and birds before cameras that stand still. None of them is in the
 training of the package's network. A blob or a box is a drone's if its middle is in the drone's box. With --detector
-MODEL.onnx the clips are also searched by a network of others (`psotrack detect`).
+MODEL.onnx the clips are also searched by a network of others (`psotrack detect`), whose boxes of all classes count.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ STILL = [f"V_DRONE_{number:03d}" for number in (4, 20, 30, 50, 60, 70, 80, 90, 1
     "V_BIRD_022",
     "V_BIRD_040",
 ]
+#: Least confidences of boxes.
+CONFIDENCES = (0.2, 0.3, 0.4, 0.5)
 #: Pixels by which the box of a clip is too small at most.
 MARGIN_PX = 3
 
@@ -158,7 +160,7 @@ def _matched(boxes: np.ndarray, truth: np.ndarray, margin_px: int) -> tuple[int,
     return int(inside.any(axis=0).sum()), len(truth), int((~inside.any(axis=1)).sum()), 1
 
 
-def clip(name: str, method: str, confidence: float, real: Path) -> dict[str, Any]:
+def clip(name: str, method: str, confidence: float, real: Path, layout: Any = None) -> dict[str, Any]:
     """A clip by a background model, or by the boxes of a detector with a least confidence."""
     from mcos_decoder import load_groundtruth  # pip install mcos-decoder
 
@@ -168,7 +170,7 @@ def clip(name: str, method: str, confidence: float, real: Path) -> dict[str, Any
     labels = labels[max(len(labels) - video.num_frames, 0) :]
     total = np.zeros(4)
     if confidence:
-        detector = find_detector(method, DetectorSettings(size=640, confidence=confidence))
+        detector = find_detector(method, DetectorSettings(size=640, confidence=confidence, layout=layout))
         told = detect_drones(detector, name, video)
         found = (told.in_frame(number).xyxy for number in range(video.num_frames))
     else:
@@ -185,10 +187,11 @@ def clip(name: str, method: str, confidence: float, real: Path) -> dict[str, Any
 
 def add_options(options: argparse.ArgumentParser) -> None:
     """Options of this study."""
-    options.add_argument("--methods", nargs="+", default=METHODS, help="background models")
+    options.add_argument("--methods", nargs="*", default=METHODS, help="background models")
     options.add_argument("--only", nargs="+", default=[""], help="cases whose names begin so [default: all]")
     options.add_argument("--rendered", type=Path, help="a sequence of experiments/rendered.py")
     options.add_argument("--detector", help="an ONNX file of others, for the clips")
+    options.add_argument("--layout", help="the layout of its output, if it does not tell")
 
 
 def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
@@ -206,12 +209,16 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[s
     if options.real is None:
         return
     networks = [each for each in options.methods if each not in ("mog2", "living")]
-    searches = [(each, 0.0) for each in options.methods]
-    searches += [(each, confidence) for each in networks for confidence in (0.2, 0.3, 0.4, 0.5)]
-    searches += [(options.detector, 0.1)] if options.detector else []
+    searches = [(each, 0.0, None) for each in options.methods]
+    searches += [(each, confidence, None) for each in networks for confidence in CONFIDENCES]
+    if options.detector:
+        searches += [
+            (options.detector, confidence, options.layout) for confidence in (0.03, 0.1, 0.3)
+        ]
     for name in filter(is_chosen, STILL):
-        for method, confidence in searches:
-            yield f"{name}:{method}:{confidence}", partial(clip, name, method, confidence, options.real)
+        for method, confidence, layout in searches:
+            row = partial(clip, name, method, confidence, options.real, layout)
+            yield f"{name}:{method}:{confidence}", row
 
 
 def show(table: pd.DataFrame, options: argparse.Namespace) -> None:

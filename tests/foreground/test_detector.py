@@ -17,7 +17,16 @@ from psotrack.trajectories import read_trajectories
 
 #: Layout of the output -> side of the network's input, pixels. "v10" needs at least 300 boxes, so 18 x 18 boxes; a
 #: network with a suppression of its own mostly has 100.
-SIZES = {"v5": 128, "v8": 128, "v10": 168, "suppressed": 104, "swapped": 104, "shares": 128, "middles": 104}
+SIZES = {
+    "v5": 128,
+    "v8": 128,
+    "v10": 168,
+    "suppressed": 104,
+    "swapped": 104,
+    "shares": 128,
+    "middles": 104,
+    "yolox": 128,
+}
 #: Pixels of the image per pixel of the network's input.
 SCALE = 2
 #: (frames, 3), positions of a drone, metres.
@@ -53,7 +62,7 @@ def painted(size, *squares, value=255):
 
 
 def detector(models, name, **settings):
-    said = "middles" if name == "middles" else None
+    said = name if name in ("middles", "yolox") else None
     settings = {"size": SIZES.get(name, 128), "layout": said} | settings
     return OnnxDetector(models / f"{name}.onnx", DetectorSettings(**settings))
 
@@ -130,6 +139,11 @@ BAD = {
     "middles": (
         {"layout": None},
         "middles.onnx: expected boxes whose layout their numbers show, found ",
+        "--layout",
+    ),
+    "yolox": (
+        {"layout": None},
+        "yolox.onnx: expected boxes with sizes above 0, found -1, as of YOLOX",
         "--layout",
     ),
     "v5": ({"confidence": 0.0}, "confidence: expected "),

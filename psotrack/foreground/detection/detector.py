@@ -7,7 +7,9 @@ output identify its layout:
 - "v8", of v8, v9 and v11: (1, 4 + classes, boxes), or turned: middle and size, confidence of each class;
 - "corners", of v10 and of networks with a suppression of their own: (1, boxes, 6): corners, and the confidence and the
   number of the class in either order; rows without a box are 0;
-- "middles": the same with middle and size instead of corners, which only the settings can say.
+- "middles": the same with middle and size instead of corners, which only the settings can say;
+- "yolox", as its authors export it: as v5, but middles in cells from a cell's own corner and logarithms of sizes in
+  cells, of the cells of three grids one after another; the input is BGR in [0, 255], which only the settings can say.
 
 Boxes are in pixels of the input, or in shares of its side. Objects of all classes count as drones: use a network that
 was trained on drones.
@@ -60,6 +62,8 @@ _GREY = (114, 114, 114)
 _ROUNDING = 1e-3
 #: Coordinates up to this number are shares of the input's side: nothing that is found is within two pixels of a corner.
 _LARGEST_SHARE = 2.0
+#: Widths of the cells of YOLOX's grids, pixels of the input.
+_CELLS_PX = (8, 16, 32)
 _SAY_LAYOUT = "say which with --layout (--detector-layout of track)"
 
 
@@ -139,7 +143,9 @@ class OnnxDetector:
         size = self.settings.size
         image, scale, start = _letterboxed(bgr, size)
         with self._opencv_errors(f"a network for images of {size} x {size} pixels", "pass its own --size"):
-            self._network.setInput(cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True))
+            is_yolox = self.settings.layout == "yolox"
+            scale_of_grey = 1.0 if is_yolox else 1 / 255
+            self._network.setInput(cv2.dnn.blobFromImage(image, scale_of_grey, swapRB=not is_yolox))
             output = self._network.forward()
         in_square, score = self._decode(np.asarray(output, np.float64))
         if np.abs(in_square[score >= self.settings.confidence]).max(initial=0.0) <= _LARGEST_SHARE:
@@ -154,7 +160,8 @@ class OnnxDetector:
         if layout == "v8" and len(table) < table.shape[1]:
             table = table.T
         columns = table.shape[1]
-        if layout is None or columns < 5 or (layout == "v5" and columns < 6):
+        has_objectness = layout in ("v5", "yolox")
+        if layout is None or columns < 5 or (has_objectness and columns < 6):
             expected = f"an output in the layout {layout}" if layout else "an output in a layout of YOLO"
             raise InputError(self.model, expected=expected, found=f"{output.shape}")
         if layout in ("corners", "middles"):
@@ -174,11 +181,27 @@ class OnnxDetector:
                 )
             expected = "finite boxes with scores from 0 to 1"
             raise InputError(self.model, expected=expected, found=found, remedy=remedy)
-        score = scores[:, 1:].max(axis=1) * scores[:, 0] if layout == "v5" else scores.max(axis=1)
+        score = scores[:, 1:].max(axis=1) * scores[:, 0] if has_objectness else scores.max(axis=1)
         if layout == "corners":
             return table[:, :4], score
         middle, half = table[:, :2], table[:, 2:4] / 2
+        if layout == "yolox":
+            corner, width = self._cells(len(table))
+            middle, half = (middle + corner) * width, np.exp(table[:, 2:4]) * width / 2
+        elif (half < 0).any():
+            expected, found = "boxes with sizes above 0", f"{2 * half.min():.3g}, as of YOLOX"
+            raise InputError(self.model, expected=expected, found=found, remedy=_SAY_LAYOUT)
         return np.hstack([middle - half, middle + half]), score
+
+    def _cells(self, count: int) -> tuple[Float[np.ndarray, "cells 2"], Float[np.ndarray, "cells 1"]]:
+        """Corner x, y, in cells, and width, in pixels, of each cell of YOLOX's grids."""
+        sides = [self.settings.size // width for width in _CELLS_PX]
+        corner = np.concatenate([np.indices((side, side))[::-1].reshape(2, -1).T for side in sides])
+        width = np.repeat(_CELLS_PX, np.square(sides))[:, None]
+        if len(corner) != count:
+            found, expected = f"{count} boxes", f"{len(corner)}, one of each cell of YOLOX's grids"
+            raise InputError(self.model, expected=expected, found=found, remedy="pass its own --size")
+        return corner.astype(float), width.astype(float)
 
     def _layout_of(self, table: Float[np.ndarray, "rows columns"]) -> Layout | None:
         """The layout of an output, None for none that is known.

@@ -10,7 +10,7 @@ from msgspec import Meta
 from psotrack.support import Positive, Share, check_types
 
 #: Layouts of a network's output (see `psotrack.foreground.detection.detector`).
-Layout = Literal["v5", "v8", "corners", "middles"]
+Layout = Literal["v5", "v8", "corners", "middles", "yolox"]
 
 
 class DetectorSettings(msgspec.Struct, frozen=True):
@@ -22,8 +22,8 @@ class DetectorSettings(msgspec.Struct, frozen=True):
             score is kept.
         size: side of the network's square input, in pixels.
         layout: layout of the network's output: "v5", middle and size, confidence of any object and of each class; "v8",
-            the same without that of any object; "corners" or "middles", a box, its confidence and class. None: told by
-            the output's shape and content.
+            the same without that of any object; "corners" or "middles", a box, its confidence and class; "yolox",
+            as YOLOX exports it. None: told by the output's shape and content.
 
     Raises:
         SettingsError: a value is out of range.
