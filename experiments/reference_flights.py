@@ -39,7 +39,7 @@ from psotrack.trajectories import Trajectories
 HERE = Path(__file__).resolve().parent
 sys.path += [str(HERE), str(HERE / "accuracy")]
 import _results
-from bat_flights import RealFlight, write_recording
+from bat_flights import write_recording
 from formula_flights import FPS, SCENES, make_flight
 
 NUMBERS = HERE / "reference_flights.json"
@@ -67,7 +67,7 @@ def from_videos(folder: Path) -> Numbers:
 def from_detections(folder: Path) -> Numbers:
     """Results from boxes by formula."""
     made = make_flight(SCENES["indoors, 8 cameras above 4 drones"], 40, seed=3)
-    write_recording(RealFlight(made.rig, made.detections, made.truth, FPS), folder)
+    write_recording(made, folder)
     recording = open_recording(folder).usable(videos=False)
     tracked = track_recording(recording, TrackSettings(method="projection-lines"), cache=folder, jobs=1)
     return numbers_of(tracked.trajectories, made.truth)

@@ -77,7 +77,8 @@ def bright_squares(layout: str, size: int) -> bytes:
     Args:
         layout: layout of the output: "v5", "v8", "v10" (the first 300 boxes only), "suppressed" (the same of class 0),
             "swapped" (class before score), "middles" (three classes), "shares" ("v8" in shares of the side), "oriented"
-            ("v8" with angles), "yolox" (of an image BGR in [0, 255]), "logits" ("v8" without the sigmoid), or "none" (one that the detector does not know).
+            ("v8" with angles), "yolox" (of an image BGR in [0, 255]), "logits" ("v8" without the sigmoid), or "none"
+            (one that the detector does not know).
         size: side of the input image, pixels.
     """
     # The boxes of YOLOX may begin in each cell.
@@ -111,7 +112,14 @@ def bright_squares(layout: str, size: int) -> bytes:
         tensors["rest"] = np.tile(np.float32([0, 0, -1, -1, 0, 1])[:, None], rest)[None]
     kernel_shape, strides, pads = [SIDE, SIDE], [STRIDE, STRIDE], [0, 0, beyond, beyond]
     nodes = [
-        _node("Conv", ["images", "kernel", "bias"], "sums", kernel_shape=kernel_shape, strides=strides, pads=pads),
+        _node(
+            "Conv",
+            ["images", "kernel", "bias"],
+            "sums",
+            kernel_shape=kernel_shape,
+            strides=strides,
+            pads=pads,
+        ),
         _node("Identity" if layout == "logits" else "Sigmoid", ["sums"], "map"),
         _node("Reshape", ["map", "flat"], "scores"),
     ]

@@ -2,10 +2,7 @@
 
     python experiments/accuracy/accuracy.py reference --data data           # the table against which changes are judged
     python experiments/accuracy/accuracy.py real_flights --data data --real REAL
-    python experiments/accuracy/accuracy.py baseline --data data --real REAL
     python experiments/accuracy/accuracy.py covariances --data data
-    python experiments/accuracy/accuracy.py association --data data --real REAL
-    python experiments/accuracy/accuracy.py markers --real REAL
     python experiments/accuracy/accuracy.py localise --data data
     python experiments/accuracy/accuracy.py foreground --data data --real REAL
 
@@ -24,12 +21,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import association
-import baseline
 import covariances
 import foreground
 import localise
-import markers
 import pandas as pd
 import real_flights
 import reference
@@ -40,10 +34,7 @@ import _results
 STUDIES = {
     "reference": reference,
     "real_flights": real_flights,
-    "baseline": baseline,
     "covariances": covariances,
-    "association": association,
-    "markers": markers,
     "foreground": foreground,
     "localise": localise,
 }

@@ -7,17 +7,17 @@ metres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
+from formula_flights import Flight
 from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import Rig, make_camera, make_rig
+from psotrack.geometry import make_camera, make_rig
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import Detections, write_detections
 from psotrack.trajectories import Trajectories
@@ -29,17 +29,7 @@ K = np.array([[1176.0, 0, 320], [0, 1176.0, 240], [0, 0, 1]])
 GPS_PX, PIXEL_PX = 5.0, 1.0
 
 
-@dataclass(frozen=True)
-class RealFlight:
-    """Frames of a real flight: rig, detections by camera, reference, and frames per second."""
-
-    rig: Rig
-    detections: dict[str, Detections]
-    truth: Trajectories
-    fps: float
-
-
-def read_flight(data: Path, name: str, first: int, num_frames: int) -> RealFlight:
+def read_flight(data: Path, name: str, first: int, num_frames: int) -> Flight:
     """Read a part of a flight.
 
     Args:
@@ -69,10 +59,10 @@ def read_flight(data: Path, name: str, first: int, num_frames: int) -> RealFligh
     row = points.nr.to_numpy() - first
     inside = (row >= 0) & (row < num_frames)
     truth_m[row[inside], 0] = place_m[inside]
-    return RealFlight(rig, detections, Trajectories(frame, frame / fps, ("drone",), truth_m), float(fps))
+    return Flight(rig, detections, Trajectories(frame, frame / fps, ("drone",), truth_m), float(fps))
 
 
-def write_recording(flight: RealFlight, folder: Path) -> None:
+def write_recording(flight: Flight, folder: Path) -> None:
     """Write rig and detections of a flight, and a `recording.toml` that names them."""
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(folder / "rig.toml", flight.rig, force=True)

@@ -32,7 +32,7 @@ from psotrack.foreground.silhouettes import (
     learning_step,
     scaled_settings,
 )
-from psotrack.recordings import VideoInfo, open_video, read_frames
+from psotrack.recordings import open_video, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
 from psotrack.support import progress_bar
@@ -126,7 +126,9 @@ def _pixels(recording: Any, method: str, data: Path) -> dict[str, float]:
     counts, blobs = np.zeros(3), np.zeros(4)
     for (_, video), shown in list(zip(recording.videos.items(), samples, strict=True))[:CAMERAS]:
         frames = np.unique(np.linspace(0, video.num_frames - 1, PER_CAMERA).round().astype(int)).tolist()
-        masks = [mask for number, mask in enumerate(_foreground(method, settings, video)) if number in frames]
+        learning = read_frames(video, learning_step(video.num_frames, settings))
+        found_in = enumerate(find_background(method, settings).foreground(learning, read_frames(video)))
+        masks = [mask for number, mask in found_in if number in frames]
         for mask, covered, truth in zip(masks, shown.covered, shown.box_px, strict=True):
             if mask is None:
                 mask = np.zeros(covered.shape, np.uint8)
@@ -139,13 +141,6 @@ def _pixels(recording: Any, method: str, data: Path) -> dict[str, float]:
         "recall": blobs[0] / max(blobs[1], 1),
         "false_per_frame": blobs[2] / blobs[3],
     }
-
-
-def _foreground(method: str, settings: ForegroundSettings, video: VideoInfo) -> Iterator[np.ndarray | None]:
-    model = find_background(method, settings)
-    yield from model.foreground(
-        read_frames(video, learning_step(video.num_frames, settings)), read_frames(video)
-    )
 
 
 def _blobs(mask: np.ndarray) -> np.ndarray:
@@ -175,7 +170,8 @@ def clip(name: str, method: str, confidence: float, real: Path, layout: Any = No
         found = (told.in_frame(number).xyxy for number in range(video.num_frames))
     else:
         settings = ForegroundSettings(reduction=1, working_reduction=1, min_blob_px=9)
-        masks = _foreground(method, settings, video)
+        learning = read_frames(video, learning_step(video.num_frames, settings))
+        masks = find_background(method, settings).foreground(learning, read_frames(video))
         found = (np.zeros((0, 4)) if mask is None else _blobs(mask) for mask in masks)
     for boxes, label in zip(found, labels, strict=False):
         box = np.zeros((0, 4)) if label is None or "BIRD" in name else np.array([label], float)
@@ -212,9 +208,7 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[s
     searches = [(each, 0.0, None) for each in options.methods]
     searches += [(each, confidence, None) for each in networks for confidence in CONFIDENCES]
     if options.detector:
-        searches += [
-            (options.detector, confidence, options.layout) for confidence in (0.03, 0.1, 0.3)
-        ]
+        searches += [(options.detector, confidence, options.layout) for confidence in (0.03, 0.1, 0.3)]
     for name in filter(is_chosen, STILL):
         for method, confidence, layout in searches:
             row = partial(clip, name, method, confidence, options.real, layout)

@@ -51,7 +51,6 @@ EXTRAS = ("control", "live", "view", "ros", "onnx", "dask")
 
 def test_what_is_declared_is_imported() -> None:
     assert declared("dependencies") <= imported("psotrack")
-    assert declared("bench") <= imported("experiments")
     assert {extra: unused for extra in EXTRAS if (unused := declared(extra) - imported("psotrack"))} == {}
 
 
