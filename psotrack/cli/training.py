@@ -30,8 +30,9 @@ def train(
     """Train a network that finds drones, on sequences whose drones are known.
 
     Simulated sequences have masks of their drones. With --from-tracks the network learns from recordings of your own:
-    where SEQ/results/tracks.csv has a drone, the foreground near it is the drone, and all else is not. SEQ may also be
-    the folder of a YOLO data set, with its own part for validation.
+    where SEQ/results/tracks.csv has a drone, the foreground near it is the drone, and all else is not; --start network
+    begins with the network that comes with the package, which takes minutes. SEQ may also be the folder of a YOLO data
+    set, with its own part for validation.
 
     The network sees a reduced frame and the learned background of its camera, and tells for each pixel whether the
     pixel shows a drone, and the boxes of the drones. After each epoch a line tells how well it does on the sequences
@@ -43,7 +44,7 @@ def train(
     Examples:
       psotrack train data/Simulated_Data/S0* --out drones.model
       psotrack train data/Simulated_Data/S0* --out drones.model --validation S02_D4_A,S04_D10 --epochs 20
-      psotrack train monday tuesday --from-tracks --out lab.model
+      psotrack train monday tuesday --from-tracks --start network --epochs 4 --steps 100 --out lab.model
       psotrack track my_lab --background drones.model
 
     Options:

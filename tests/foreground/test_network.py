@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import onnxruntime
 import pytest
@@ -188,6 +189,19 @@ def test_an_interrupted_training_goes_on_to_the_same_bytes(tmp_path):
     train([pictures()], [pictures()], tmp_path / "part.model", QUICK, about=about)
     assert (tmp_path / "part.model").read_bytes() == (tmp_path / "whole.model").read_bytes()
     assert not (tmp_path / "part.unfinished").exists()
+
+
+def test_a_training_starts_from_a_network(trained, tmp_path):
+    out = tmp_path / "drones.model"
+    settings = msgspec.structs.replace(QUICK, start=str(trained), learning_rate=1e-4)
+    found = train([pictures()], [pictures()], out, settings, about={}).card["validation"]
+    assert found["pixel_f"] > 0.85  # four small steps forget nothing; without a start 0.0
+    settings = msgspec.structs.replace(QUICK, start="drones.onnx")
+    assert_refused(
+        lambda: train([pictures()], [pictures()], tmp_path / "b.model", settings, about={}),
+        "start: expected network, or a file of `psotrack train` that ends in .model, found drones.onnx",
+        unchanged=tmp_path,
+    )
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ class TrainSettings(msgspec.Struct, frozen=True):
         validation: names of the sequences for validation, not for training. None: the last sequence.
         from_tracks: whether SEQ/results/tracks.csv says where the drones are, and the foreground which pixels they
             cover; else the masks of simulated sequences say both.
+        start: "network", or a file of `psotrack train`: the network that goes on learning. None: one that knows
+            nothing.
         per_camera: largest number of frames of each camera that are learned, spread over its video.
         epochs: largest number of epochs; the network of the best one is kept.
         steps: steps of an epoch.
@@ -32,6 +34,7 @@ class TrainSettings(msgspec.Struct, frozen=True):
 
     validation: tuple[str, ...] | None = None
     from_tracks: bool = False
+    start: str | None = None
     per_camera: Annotated[int, Meta(ge=2)] = 40
     epochs: Annotated[int, Meta(ge=1)] = 20
     steps: Annotated[int, Meta(ge=1)] = 350

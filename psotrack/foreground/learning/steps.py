@@ -69,9 +69,9 @@ class Teacher:
         self._optimiser, self._seed = optax.chain(optax.clip_by_global_norm(_LARGEST_GRADIENT), adam), seed
 
     @as_written()
-    def begin(self) -> State:
-        """The state before the first step."""
-        network = untrained(self._seed)
+    def begin(self, network: Network | None = None) -> State:
+        """The state before the first step, of a network or of one that knows nothing."""
+        network = untrained(self._seed) if network is None else network
         return State(network, self._optimiser.init(eqx.filter(network, eqx.is_array)), network)
 
     @as_written()

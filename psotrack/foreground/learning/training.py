@@ -25,10 +25,11 @@ from psotrack.foreground.learning.scores import score
 from psotrack.foreground.learning.settings import TrainSettings
 from psotrack.foreground.learning.steps import State, Teacher
 from psotrack.foreground.learning.tracked import TrackedDrones
-from psotrack.foreground.network import Model, from_bytes, head_of, to_bytes, write_model
+from psotrack.foreground.network import Model, from_bytes, head_of, model_at, to_bytes, write_model
+from psotrack.foreground.network.names import MODEL_SUFFIX, NETWORK, model_path
 from psotrack.foreground.silhouettes import SilhouetteSettings, num_processes, scaled_settings
 from psotrack.recordings.datasets import open_recording
-from psotrack.support import Report, atomic_write, digest_record, no_progress
+from psotrack.support import Report, atomic_write, digest_file, digest_record, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -122,7 +123,8 @@ def train(
         say: is told a line after each epoch.
 
     Raises:
-        InputError: no sample shows a drone, or the samples show nothing but one colour.
+        InputError: no sample shows a drone, the samples show nothing but one colour, or the network to start from
+            cannot be read.
         OutputError: a file cannot be written.
     """
     _check(training, "training")
@@ -130,8 +132,14 @@ def train(
     steps = settings.epochs * settings.steps
     teacher = Teacher(settings.learning_rate, steps, settings.seed)
     unfinished = out.with_suffix(_STATE_SUFFIX)
-    of = digest_record({"settings": msgspec.to_builtins(settings), "about": dict(about)})
-    state, history = _resumed(unfinished, teacher.begin(), of)
+    path = model_path(settings.start or NETWORK)
+    if path is None:
+        expected = f"{NETWORK}, or a file of `psotrack train` that ends in {MODEL_SUFFIX}"
+        raise SettingsError("start", expected=expected, found=f"{settings.start}")
+    start = model_at(path) if settings.start else None
+    about = {**about, "start": digest_file(path) if start else None}
+    of = digest_record({"settings": msgspec.to_builtins(settings), "about": about})
+    state, history = _resumed(unfinished, teacher.begin(start and start.network), of)
     with report("train", steps) as advance, ThreadPoolExecutor(1) as ahead:
         advance(len(history) * settings.steps)
         while len(history) < settings.epochs and _since_best(history) < settings.patience:
