@@ -131,20 +131,14 @@ def files(flight, tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        *(
-            (f"track {{flight}} --out out.csv --cache cache {options}", said)
-            for options, said in TRACK.items()
-        ),
-        *COMMANDS.items(),
-    ],
-    ids=lambda each: each[:60] if isinstance(each, str) else "",
-)
-def test_a_command_refuses(words, said, files, flight, run_psotrack, little_memory):
-    words = [word.format(flight=flight) for word in words.split()]
-    said = [each.format(flight=flight) for each in said]
+for options, said in TRACK.items():
+    COMMANDS[f"track {{flight}} --out out.csv --cache cache {options}"] = said
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[:60])
+def test_a_command_refuses(command, files, flight, run_psotrack, little_memory):
+    words = [word.format(flight=flight) for word in command.split()]
+    said = [each.format(flight=flight) for each in COMMANDS[command]]
     assert_refused(lambda: run_psotrack(*words), *said, unchanged=files)
 
 
@@ -183,6 +177,7 @@ def test_a_record_made_in_python_has_the_limits(tmp_path):
 LFS = "version https://git-lfs.github.com/spec/v1"
 NUL = "expected UTF-8 text, found a NUL"
 FRAME = "line 2: expected a whole number from 0 in frame"
+POINT, POINTER = "decimals with a point", "found a Git LFS pointer"
 
 
 def rows_of(count, row):
@@ -195,80 +190,42 @@ def json_of_empty_drones():
     return json.dumps(content | {"drones": [{"name": "a", "position_m": []}] * len(frames)})
 
 
-#: Name of the case -> name of the file, its text, the function that reads it, words of the line.
+MOTIVE = "Format Version,1.23,Take Name,a\n\n,,Type\n"
+#: Name of the case -> name of the file, the function that reads it, its text, words of the line.
 TEXTS = {
     "a huge frame of poses": (
-        "dron1_pos_25.csv",
-        "id;pos_x[m];pos_y[m];pos_z[m]\n0;0;0;0\n300000000;1;2;3\n",
-        read_poses,
-        ["line 3, column id: expected a frame number", "found 300000000"],
+        *("dron1_pos_25.csv", read_poses, "id;pos_x[m];pos_y[m];pos_z[m]\n0;0;0;0\n300000000;1;2;3\n"),
+        *("line 3, column id: expected a frame number", "found 300000000"),
     ),
-    "a frame of 300 digits": ("t.csv", f"{HEAD}1e300,0,a,0,0,1\n", read_trajectories, [FRAME]),
+    "a frame of 300 digits": ("t.csv", read_trajectories, f"{HEAD}1e300,0,a,0,0,1\n", FRAME),
     # Arrays over frames and drones would have a cell for each pair: 10^10 for 3 MB of text.
     "a drone of its own in each row": (
-        "t.csv",
-        HEAD + rows_of(100_000, "{0},{0},d{0},0,0,1\n"),
-        read_trajectories,
-        ["found 100000 frames and 100000 drones in 100000 rows"],
+        *("t.csv", read_trajectories, HEAD + rows_of(100_000, "{0},{0},d{0},0,0,1\n")),
+        "found 100000 frames and 100000 drones in 100000 rows",
     ),
     "an identity of its own in each row": (
         "tracks.txt",
-        rows_of(20_000, "{1},{1},-1,-1,-1,-1,1,0,0,1\n"),
         lambda path: (path.with_name("seqinfo.ini").exists(), read_tracks(path)),
-        ["tracks.txt: expected drones that are there in most frames"],
+        rows_of(20_000, "{1},{1},-1,-1,-1,-1,1,0,0,1\n"),
+        "tracks.txt: expected drones that are there in most frames",
     ),
-    "thousands of empty drones": ("t.json", json_of_empty_drones(), read_tracks, ["t.json"]),
-    "a NUL in a row": ("t.csv", f"{HEAD}0,0,a\0,0,0,1\n", read_trajectories, ["t.csv", NUL]),
-    "semicolons": (
-        "t.csv",
-        HEAD.replace(",", ";"),
-        read_trajectories,
-        ["separated by commas, found semicolons"],
-    ),
-    "a decimal comma": (
-        "t.csv",
-        f'{HEAD}0,0,a,"0,5",0,1\n',
-        read_trajectories,
-        ["line 2", "decimals with a point"],
-    ),
-    "a pointer of Git LFS": (
-        "a.c3d",
-        f"{LFS}\noid sha256:0\n",
-        read_c3d,
-        ["a.c3d", "found a Git LFS pointer", "git lfs pull"],
-    ),
-    "a video that is a pointer": (
-        "a.mp4",
-        f"{LFS}\n",
-        probe,
-        ["a.mp4: expected a video, found a Git LFS pointer"],
-    ),
-    "a ROS 1 bag": ("a.bag", "#ROSBAG V2.0\n", read_tracks, ["found a ROS 1 bag", "rosbags-convert"]),
-    "a table of Motive": (
-        "a.csv",
-        "\ufeffFormat Version,1.23,Take Name,a\n\n,,Type\n",
-        read_tracks,
-        ["OptiTrack Motive; export C3D"],
-    ),
-    "poses of Motive": (
-        "a.csv",
-        "Format Version,1.23,Take Name,a\n\n,,Type\n",
-        read_poses,
-        ["OptiTrack Motive; export C3D"],
-    ),
-    "a table of Nexus": (
-        "a.csv",
-        "Trajectories\n100\n",
-        read_poses,
-        ["found a table of Vicon Nexus; export C3D"],
-    ),
-    "a NUL in TOML": ("recording.toml", "version = 1\n#\0\n", open_recording, ["recording.toml", NUL]),
+    "thousands of empty drones": ("t.json", read_tracks, json_of_empty_drones(), "t.json"),
+    "a NUL in a row": ("t.csv", read_trajectories, f"{HEAD}0,0,a\0,0,0,1\n", "t.csv", NUL),
+    "semicolons": ("t.csv", read_trajectories, HEAD.replace(",", ";"), "by commas, found semicolons"),
+    "a decimal comma": ("t.csv", read_trajectories, f'{HEAD}0,0,a,"0,5",0,1\n', "line 2", POINT),
+    "a pointer of Git LFS": ("a.c3d", read_c3d, f"{LFS}\noid sha256:0\n", "a.c3d", POINTER, "git lfs pull"),
+    "a video that is a pointer": ("a.mp4", probe, f"{LFS}\n", "a.mp4: expected a video, ", POINTER),
+    "a ROS 1 bag": ("a.bag", read_tracks, "#ROSBAG V2.0\n", "found a ROS 1 bag", "rosbags-convert"),
+    "a table of Motive": ("a.csv", read_tracks, f"\ufeff{MOTIVE}", "OptiTrack Motive; export C3D"),
+    "poses of Motive": ("a.csv", read_poses, MOTIVE, "OptiTrack Motive; export C3D"),
+    "a table of Nexus": ("a.csv", read_poses, "Trajectories\n100\n", "table of Vicon Nexus; export C3D"),
+    "a NUL in TOML": ("recording.toml", open_recording, "version = 1\n#\0\n", "recording.toml", NUL),
 }
 
 
 @pytest.mark.parametrize("name", TEXTS)
 def test_a_text_is_refused(name, tmp_path, little_memory):
-    file, text, read, said = TEXTS[name]
+    file, read, text, *said = TEXTS[name]
     (tmp_path / "seqinfo.ini").write_text("[Sequence]\nframeRate=25\n")
     (tmp_path / file).write_text(text, encoding="utf-8")
     assert_refused(lambda: read(tmp_path / file), *said, unchanged=tmp_path)

@@ -181,19 +181,14 @@ def test_more_frames_than_16_bits_hold(tmp_path, caplog):
 
 @pytest.mark.parametrize(
     ("unit", "metres"),
-    [("M", 1), ("METERS", 1), ("cm", 0.01), ("um", 1e-6), ("in", 0.0254), ("feet", 0.3048)],
+    [("M", 1), ("METERS", 1), ("cm", 0.01), ("um", 1e-6), ("in", 0.0254), ("feet", 0.3048), (None, 0.001)],
 )
-def test_units(tmp_path, unit, metres):
+def test_units(tmp_path, unit, metres, caplog):
     points = make_points()
-    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=(unit,)))
+    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=unit and (unit,)))
     np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] * metres, rtol=1e-6)
-
-
-def test_coordinates_without_a_unit_are_millimetres(tmp_path, caplog):
-    points = make_points()
-    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=None))
-    np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
-    assert "a.c3d: it has no POINT:UNITS; its coordinates are read as millimetres" in caplog.text
+    said = "a.c3d: it has no POINT:UNITS; its coordinates are read as millimetres"
+    assert (said in caplog.text) == (unit is None)
 
 
 def test_a_file_without_parameters_is_read_by_its_header(tmp_path, caplog):
@@ -547,7 +542,8 @@ def people(position_m) -> Markers:
 #: A person who stands still is rigid, but larger than a drone.
 STILL_M = np.random.default_rng(0).uniform(0, [0.5, 0.4, 1.8], (12, 3))
 ONE = make_markers(drones=("cf1",))
-#: Name of the case -> markers, words of the line.
+TWO_OF_A_NAME = with_markers(ONE, ["cf2:cf11"], 0.0)
+#: Name of the case -> markers, words of the line, and the label of the drone, if it is given.
 BODIES = {
     # Found: a person's C3D in a sequence's folder became drones without a word.
     "a person": (
@@ -566,20 +562,16 @@ BODIES = {
         Markers(("Dron2:1",), np.full((9, 1, 3), np.nan), RATE_HZ),
         "expected three markers of a drone in some frame, found none",
     ),
+    "the label of none": (TWO_OF_A_NAME, "body cf1, R01_D2.c3d: expected labels of cf1:cf11, cf1:c", "b9"),
+    "the label of two": (TWO_OF_A_NAME, "one marker called 'cf11', found 2", "cf11"),
 }
 
 
-@pytest.mark.parametrize(("markers", "words"), BODIES.values(), ids=BODIES)
-def test_what_is_no_drone_for_certain_is_refused(tmp_path, markers, words):
-    assert_refused(lambda: marker_bodies(markers, WHERE), f"{WHERE}", words, unchanged=tmp_path)
-
-
-def test_the_label_of_no_marker_or_of_two_is_refused(tmp_path):
-    markers = with_markers(ONE, ["cf2:cf11"], 0.0)
-    words = "body cf1, R01_D2.c3d: expected labels of cf1:cf11, cf1:cf12, "
-    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": ["b9"]}), words, unchanged=tmp_path)
-    words = "one marker called 'cf11', found 2"
-    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": ["cf11"]}), words, unchanged=tmp_path)
+@pytest.mark.parametrize("case", BODIES)
+def test_what_is_no_drone_for_certain_is_refused(tmp_path, case):
+    markers, words, *label = BODIES[case]
+    bodies = {"cf1": label} if label else None
+    assert_refused(lambda: marker_bodies(markers, WHERE, bodies), f"{WHERE}", words, unchanged=tmp_path)
 
 
 #: Words of the line -> points, keywords of `make_c3d`.
