@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from helpers import fading
 from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.inside_out import CameraPath, Flag, write_camera_path
@@ -130,11 +131,7 @@ def smooth_flight(rng, num_frames, offset_s=0.0):
 
 def correlated_errors(rng, num_frames, time_s):
     """Gauss-Markov errors with a variance of 1: (frames, 3)."""
-    left = np.exp(-1 / FPS / time_s)
-    values = rng.normal(size=(num_frames, 3))
-    for k in range(1, num_frames):
-        values[k] = left * values[k - 1] + np.sqrt(1 - left**2) * values[k]
-    return values
+    return fading(rng.normal(size=(num_frames, 3)), np.exp(-1 / FPS / time_s))
 
 
 #: Errors of both sources: standard deviations, metres, and factors on the stated ones; the parts of the variances that

@@ -9,6 +9,16 @@ from psotrack.trajectories import Status, Trajectories
 
 #: Frames per second. Frames 0 and 1 are the first second, in which identity is fixed.
 FPS = 2.0
+#: Keys of the errors as JSON, which the contract promises.
+ERROR_KEYS = {
+    *("frames", "drones", "missed_rate", "id_switches", "mota", "motp_m", "idf1", "per_drone"),
+    *("mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
+    *("matched_mean_error_m", "offset_removed_mean_error_m"),
+    *("hota", "deta", "assa", "loca"),
+    *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
+    *("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg"),
+    *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
+}
 #: Tolerance for sums of a few float64 numbers of some metres, metres.
 ROUNDING = 1e-12
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from dpjait_folders import make_simulated
+from helpers import posed, simple_lens
 from marker_pictures import draw
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import lens_of_view
 from psotrack.foreground.markers import DetectedMarkers
-from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry import make_rig, project
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter
 from psotrack.recordings.datasets import write_marker_corners
@@ -24,22 +24,8 @@ SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -
 RATE_HZ = 25.0
 
 
-def simple_lens(focal_px, size_wh, dist=()):
-    """A camera at the origin, whose axis meets the middle of the image."""
-    width, height = size_wh
-    K = np.array([[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]])
-    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh, dist=dist)
-
-
 #: A camera with a little distortion.
 LENS = simple_lens(900.0, (1280, 720), (-0.08, 0.02, 0.0004, -0.0003))
-
-
-def posed(lens, centre_m, target_m):
-    """The camera at a place, looking at a point."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = look_at(tuple(centre_m), tuple(target_m))
-    return replace(lens, T_cam_world=T)
 
 
 def marker_at(centre_m, front, turn_deg=0.0, *, side_m=0.3):

@@ -22,7 +22,7 @@ from board_rigs import (
     write_pairs,
 )
 from clock_worlds import random_motion, simulate_estimate, simulate_reference
-from helpers import assert_refused, make_once, ring_rig
+from helpers import assert_refused, make_once, posed, ring_rig, simple_lens
 from marker_worlds import draw_markers, marker_at
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
@@ -47,7 +47,7 @@ from psotrack.calibration import (
 )
 from psotrack.calibration.rig.moving_point import adjust
 from psotrack.evaluation import find_offset
-from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
+from psotrack.geometry import Rig, make_rig, project
 from psotrack.geometry.rig_files import read_lenses, read_rig, write_calibration, write_rig
 from psotrack.recordings import Detections, VideoWriter, write_detections
 from psotrack.recordings.datasets import write_marker_corners
@@ -431,9 +431,8 @@ def fit_read_world(path):
 
 # Points before a camera.
 RNG = np.random.default_rng(9)
-K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
-R, T_M = look_at((4.0, 3.0, 2.0), (0.0, 0.0, 1.0))
-CAMERA = make_camera(R=R, t_m=T_M, K=K, image_size_wh=(1920, 1080))
+LENS = simple_lens(1157.0, (1920, 1080))
+CAMERA = posed(LENS, (4.0, 3.0, 2.0), (0.0, 0.0, 1.0))
 POINTS_M = RNG.uniform((-1, -1, 0), (1, 1, 2), (12, 3))
 PIXELS, _ = project(CAMERA, POINTS_M)
 #: Points on a line.
@@ -441,8 +440,7 @@ LINE_M = POINTS_M[0] + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
 LINE_PX, _ = project(CAMERA, LINE_M)
 #: A sheet of 20 cm at a distance of 8 m, tilted a little, looks the same if it is tilted to the other side.
 SHEET_M = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
-SHEET_R, SHEET_T_M = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-SHEET_CAMERA = make_camera(R=SHEET_R, t_m=SHEET_T_M, K=K, image_size_wh=(1920, 1080))
+SHEET_CAMERA = posed(LENS, (0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
 SHEET_PX = project(SHEET_CAMERA, SHEET_M)[0] + np.random.default_rng(0).normal(0, 0.5, (6, 2))
 located = partial(calls, locate_camera, name="camera c7")
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from clock_worlds import FPS, LATE_S, make_late_videos, random_motion, simulate_estimate, simulate_reference
-from helpers import make_once, ring_rig
+from helpers import fading, make_once, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -15,14 +15,6 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration.clocks import camera_offsets
 from psotrack.evaluation import find_offset
 from psotrack.trajectories import UNASSIGNED
-
-
-def correlated(noise, correlation):
-    """Noise of standard deviation 1, as a first-order autoregression along the first axis."""
-    noise = noise.copy()
-    for row in range(1, len(noise)):
-        noise[row] = correlation * noise[row - 1] + np.sqrt(1 - correlation**2) * noise[row]
-    return noise
 
 
 def find(estimate, *paths, max_offset_s=0.5, **options):
@@ -96,7 +88,7 @@ def test_the_true_offset_is_within_two_standard_deviations(errors):
         if errors == "independent":
             error_m = 0.02 * noise
         elif errors == "correlated":
-            error_m = 0.02 * correlated(noise, 0.95)
+            error_m = 0.02 * fading(noise, 0.95)
         else:
             error_m = turning_error(rng, estimate.time_s) + 0.005 * noise
         found = find(replace(estimate, position_m=estimate.position_m + error_m), *paths)
@@ -233,7 +225,7 @@ def test_the_true_offsets_of_cameras_are_within_two_standard_deviations(errors):
         points_px = with_errors(exact_px, noise_px=0.5, seed=seed)
         noise = rng.normal(size=points_px.shape)
         if errors == "correlated":
-            points_px += 1.5 * correlated(noise, 0.9)
+            points_px += 1.5 * fading(noise, 0.9)
         elif errors == "calibration":
             points_px += 2 * noise[0, 0]
         found = camera_offsets(RIG, points_px, FPS)

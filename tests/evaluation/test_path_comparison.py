@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_paths import camera_path
+from clock_worlds import random_motion
 from evo.core import metrics, sync
 from evo.tools import file_interface
 from helpers import assert_refused
@@ -35,13 +36,7 @@ CLOCK_S, TURN_CLOCK_S = 0.3137, -2.173
 
 def flown_m(time_s, speed_m_s=1.0, seed=0):
     """Motion that never repeats, at about this speed: (times, 3), metres."""
-    rng = np.random.default_rng(seed)
-    rate = rng.uniform(0.4, 1.6, (4, 3))
-    phase = rng.uniform(0, 2 * np.pi, (4, 3))
-    angle = rate * np.asarray(time_s)[:, None, None] + phase
-    amplitude_m = speed_m_s / np.sqrt(6) / rate
-    swung_m = (amplitude_m * np.sin(angle)).sum(axis=1)
-    return np.array([0.0, 0.0, 1.5]) + swung_m
+    return random_motion(seed, speed_m_s)(time_s) - [3.0 * seed, 0.0, 0.0]
 
 
 def body_orientations(time_s, seed=1) -> Rotation:

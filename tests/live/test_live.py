@@ -26,7 +26,6 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
-import worlds
 from helpers import assert_refused, listening_at, make_once
 from small_sweeps import wait_until
 
@@ -278,12 +277,6 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
         simulate(recipe, folder, settings, jobs=1)
 
     return make_once(tmp_path_factory, "live_sequence", make) / "Simulated_Data" / "S02_D4_A"
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A smaller flight, for what needs no drones that can be tracked."""
-    return worlds.two_flights(tmp_path_factory) / "flight"
 
 
 @pytest.fixture
@@ -702,27 +695,16 @@ def test_only_pages_of_this_computer_may_read(port: int, server: WebSocketLines)
         client().connect(f"ws://127.0.0.1:{port}", origin="https://example.com")
 
 
-#: Address -> words of the line.
-BAD_ADDRESSES = {
-    **dict.fromkeys(
-        ("", "nowhere", "127.0.0.1:", "9000:", "0", "70000", "1.5", "٣"),
-        "--websocket: expected PORT or HOST:PORT",
-    ),
-    "no.such.host.invalid:9000": "expected an address of this computer",
-}
+NO_ADDRESSES = ("", "nowhere", "127.0.0.1:", "9000:", "0", "70000", "1.5", "٣")
 
 
-@pytest.mark.usefixtures("port")
-@pytest.mark.parametrize("address", BAD_ADDRESSES)
-def test_an_address_that_is_none(address: str, tmp_path: Path) -> None:
-    assert_refused(lambda: WebSocketLines(address), BAD_ADDRESSES[address], unchanged=tmp_path)
-
-
-def test_a_port_in_use_is_one_line(port: int, server: WebSocketLines, tmp_path: Path) -> None:
-    words = "expected an address of this computer that is free", "in use"
-    assert_refused(lambda: WebSocketLines(f"{port}"), *words, unchanged=tmp_path)
-
-
-def test_without_the_package_the_error_says_how_to_install_it(tmp_path: Path, monkeypatch) -> None:
+def test_an_address_that_is_none_a_port_in_use_and_a_missing_package_are_one_line(
+    port: int, server: WebSocketLines, tmp_path: Path, monkeypatch
+) -> None:
+    refusals = {key: ["--websocket: expected PORT or HOST:PORT"] for key in NO_ADDRESSES}
+    refusals["no.such.host.invalid:9000"] = ["expected an address of this computer"]
+    refusals[f"{port}"] = ["expected an address of this computer that is free", "in use"]
+    for address, words in refusals.items():
+        assert_refused(lambda address=address: WebSocketLines(address), *words, unchanged=tmp_path)
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
     assert_refused(lambda: WebSocketLines("9000"), "pip install '.[live]'", unchanged=tmp_path)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_refused
-from worlds import two_flights
 
 import psotrack as pt
 from psotrack.foreground.silhouettes import ForegroundSettings, find_background
@@ -246,8 +245,8 @@ def installed(tmp_path_factory, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    return pt.read_recording(two_flights(tmp_path_factory) / "flight")
+def recording(flight):
+    return pt.read_recording(flight)
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from helpers import assert_refused, cameras_of, ring_rig
+from helpers import assert_refused, cameras_of, opencv_pixels, ring_rig, sphere_points
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
@@ -51,15 +50,6 @@ def flight_with(record, recording=None) -> TrackedFlight:
     return TrackedFlight("lab", (replace(tracks, record=as_run_record(record, "tracks")),), recording)
 
 
-def pixels_by_opencv(camera, points_m):
-    """(points, 2), pixels by OpenCV's own projection, as an oracle."""
-    rotation, _ = cv2.Rodrigues(camera.T_cam_world[:3, :3])
-    t_m, dist = camera.T_cam_world[:3, 3], np.array(camera.dist)
-    points_m = np.ascontiguousarray(points_m)
-    pixels, _ = cv2.projectPoints(points_m, rotation, t_m, camera.K, dist)
-    return pixels[:, 0]
-
-
 @pytest.mark.parametrize(
     ("camera", "offset_s", "line_time_s"), [(0, 0.0, 1e-4), (1, 0.015, 0.0), (2, 0.0, 0.0)]
 )
@@ -77,23 +67,22 @@ def test_boxes_and_ellipses_are_about_the_drones_at_the_exposure(camera, offset_
     views = view_in_images(recording, tracks, SIZE_M)
     assert (views.frame[:, camera] == np.arange(NUM_FRAMES)).all()
     assert views.boxes_px.shape == (NUM_FRAMES, 2, 3, 4)
-    direction = np.random.default_rng(0).normal(size=(4000, 3))
-    sphere = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    sphere = sphere_points(4000)
     for drone in range(2):
         # Rows are exposed one after the other from the frame's time on. During the exposure of the drone, the row
         # itself moves by less than two rows, 1 mm of flight, 0.1 pixels.
         place_m = position_m[number, drone]
-        ((_, row_px),) = pixels_by_opencv(seen_by, place_m[None])
+        ((_, row_px),) = opencv_pixels(seen_by, place_m[None])
         exposed_s = offset_s + line_time_s * (row_px + 0.5)
         at_m = place_m + exposed_s * velocity_m_s[0, 0]
-        pixels = pixels_by_opencv(seen_by, at_m + sphere * SIZE_M[drone] / 2) + 0.5
+        pixels = opencv_pixels(seen_by, at_m + sphere * SIZE_M[drone] / 2) + 0.5
         expected = [*pixels.min(axis=0), *pixels.max(axis=0)]
-        # 4,000 random points miss the outermost point of the surface by less than a fifth of a pixel.
+        # 4,000 points miss the outermost point of the surface by less than a fifth of a pixel.
         np.testing.assert_allclose(views.boxes_px[number, drone, camera], expected, atol=0.2)
 
         variance_m2 = np.diag(tracks.covariance_m2[number, drone])
         half_m = np.sqrt(variance_m2 * chi2.ppf(0.9, 3))
-        off = pixels_by_opencv(seen_by, at_m + sphere * half_m)
+        off = opencv_pixels(seen_by, at_m + sphere * half_m)
         off -= views.middle_px[number, drone, camera]
         shape_px2 = views.shape_px2[number, drone, camera]
         radius2 = (off @ np.linalg.inv(shape_px2) * off).sum(axis=1)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import rerun as rr
-from helpers import Output, assert_refused, drawn_silhouettes, listening_at
+from helpers import AT_A_TERMINAL, Output, assert_refused, drawn_silhouettes, listening_at
 from rerun.chunk import RrdReader
 from worlds import CAMERAS, COASTING, IMAGE_SIZE_WH, LOST_FROM, NUM_FRAMES, REFERENCE, make_tracks
 
@@ -256,19 +256,10 @@ def test_a_full_disk_is_one_line(start_python, world, tmp_path):
     assert_refused(view, "x.rrd", "the whole file", "disk", unchanged=tmp_path)
 
 
-#: The program with Ctrl-C as at a terminal: a shell starts programs in the background with Ctrl-C ignored.
-HEARS_CTRL_C = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from psotrack.__main__ import main
-main()
-"""
-
-
 @pytest.mark.slow
 def test_the_page_for_a_browser(start_python, world):
     """The page is served to this computer only, and Ctrl-C ends the command and its server."""
-    process = start_python("-c", HEARS_CTRL_C, "view", world / "tracks.csv", "--web")
+    process = start_python("-c", AT_A_TERMINAL, "view", world / "tracks.csv", "--web")
     page = next(line.split()[0] for line in process.stdout if line.startswith("http://"))
     assert page.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(page, timeout=60) as answer:

@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 import pytest
 from helpers import environment_without_jax_settings
-from worlds import two_flights
 
 from psotrack.support import compiled, drop_programs_if_many, keep_compiled, measured_compiling
 
@@ -130,9 +129,8 @@ def test_threads_that_compile_at_the_same_time_count_once() -> None:
 
 
 @pytest.mark.slow
-def test_settings_of_jax_for_other_programs_change_no_result(start_python, tmp_path_factory, tmp_path):
+def test_settings_of_jax_for_other_programs_change_no_result(start_python, flight, tmp_path):
     """Neither of both trackers together, of smoothing and clocks, of tracking step by step, nor of drawn boxes."""
-    flight = two_flights(tmp_path_factory) / "flight"
     swarm = "--particles 8 --iterations 4 --drone-size 0.4,0.4,0.2"
 
     def done(name: str, **variables: str) -> tuple[int, str, Path]:

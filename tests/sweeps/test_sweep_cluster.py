@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers import assert_refused, listening_at
+from helpers import AT_A_TERMINAL, assert_refused, listening_at
 from small_sweeps import all_rows, environment, grid_file, small_sequence, wait_until
 
 from psotrack.sweeps import Cluster, Inputs, Store, read_grid, runner
@@ -32,13 +32,6 @@ def die_once(event, arguments):
             os.kill(os.getpid(), signal.SIGKILL)
 
 sys.addaudithook(die_once)
-"""
-#: `psotrack` as at a terminal: shells start programs in the background with Ctrl-C ignored.
-AT_A_TERMINAL = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from psotrack.__main__ import main
-main()
 """
 
 
