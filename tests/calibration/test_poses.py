@@ -172,12 +172,8 @@ def world(rng, count, *, flat=False):
     points_m = rng.uniform(-1, 1, (count, 3))
     if flat:
         points_m[:, 2] = 0.3 * points_m[:, 0] + 0.2
-    return T, points_m, rays_of(T, points_m)
-
-
-def rays_of(T, points_m):
     in_camera = points_m @ T[:3, :3].T + T[:3, 3]
-    return in_camera[:, :2] / in_camera[:, 2:]
+    return T, points_m, in_camera[:, :2] / in_camera[:, 2:]
 
 
 @pytest.mark.parametrize(

@@ -137,10 +137,6 @@ def test_a_folder_a_file_and_a_folder_of_the_dataset_are_recordings(folder):
     np.testing.assert_array_equal(open_recording(folder).rig.cameras.K, rig.cameras.K)
 
 
-def write_times(folder, times):
-    (folder / "times.csv").write_text("frame,time_s\n" + "".join(f"{i},{t}\n" for i, t in enumerate(times)))
-
-
 TIMED = camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE)
 
 
@@ -163,7 +159,8 @@ def test_video_and_times_of_a_program_that_was_killed(folder, unfinished, num_ti
     shutil.copy(unfinished, folder)
     # Not quite regular.
     times = [index / 25 + 0.001 * (index % 2) for index in range(num_times)]
-    write_times(folder, times)
+    rows = "".join(f"{i},{t}\n" for i, t in enumerate(times))
+    (folder / "times.csv").write_text(f"frame,time_s\n{rows}")
     left = open_recording(write_recording(folder, TIMED, RIGHT)).by_name["left"]
     whole = probe(folder / "left.avi")
     # FFmpeg holds back the last 32 KiB, a few frames of this noise.
@@ -540,10 +537,6 @@ def frames_of(path, fps=None):
     return lambda folder: list(read_frames(open_video(folder / path, fps)))
 
 
-def small_picture(folder):
-    cv2.imwrite(str(folder / LAST), np.zeros((32, 64), np.uint8))
-
-
 #: Name of the case -> what happens to the folder, what is called, words of the line.
 PICTURES = {
     "an ending": (nothing, writes("a.mkv"), "video: expected"),
@@ -554,7 +547,8 @@ PICTURES = {
                                 "frame: expected shape (48, 64, 3)"),
     "pictures of no rate": (nothing, frames_of("any/pictures"), "pictures: expected the rate of its pictures, "),
     "a single picture": (nothing, frames_of(LAST), "frame11.png: expected a video, or a folder of pictures"),
-    "a small picture": (small_picture, frames_of("any/pictures", 25.0),
+    "a small picture": (lambda folder: cv2.imwrite(str(folder / LAST), np.zeros((32, 64), np.uint8)),
+                        frames_of("any/pictures", 25.0),
                         "frame11.png: expected 64 x 48 pixels as in frame0.png, found 64 x 32"),
 }  # fmt: skip
 
@@ -641,7 +635,6 @@ EXPORTS = {
 
 # --- what the dataset's layout cannot hold
 
-SOUND = make_camera(**UPRIGHT)
 #: Words of the line -> fields of a camera.
 LAYOUT = {
     "distortion by k1, k2, p1, p2 alone, found 5 coefficients": {"dist": (0.1, 0.0, 0.0, 0.0, 0.01)},
@@ -654,7 +647,7 @@ LAYOUT = {
 def calibration_of(fields):
     """The message names the camera that the file cannot hold, not the first one."""
     camera = make_camera(**UPRIGHT | fields)
-    rig = make_rig({"a": SOUND, "GoPro 3": camera, "z": camera})
+    rig = make_rig({"a": make_camera(**UPRIGHT), "GoPro 3": camera, "z": camera})
     return lambda folder: write_calibration(folder / "a.csv", rig)
 
 

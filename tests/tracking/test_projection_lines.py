@@ -370,10 +370,9 @@ FORMULA = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "accura
 SCENES, make_flight = FORMULA["SCENES"], FORMULA["make_flight"]
 
 LENS = simple_lens(1000.0, (1920, 1080))
-SKY_M = (0.0, 0.0, 15.0)
 
 
-def ground_rig(num_cameras, target_m=SKY_M, height_m=1.5):
+def ground_rig(num_cameras, target_m=(0.0, 0.0, 15.0), height_m=1.5):
     """Cameras on the ground on a circle of 25 m, which all look at one place."""
     cameras = []
     for angle in 2 * np.pi * np.arange(num_cameras) / num_cameras + 0.3:
