@@ -36,7 +36,7 @@ from hypothesis import HealthCheck, settings
 if os.environ.get("PSOTRACK_TYPE_CHECKS") == "on":
     jaxtyping.install_import_hook("psotrack", "checked_types.checked")
 
-from helpers import Output, make_once
+from helpers import Output, made_once
 from worlds import make_two_flights
 
 # Conversions such as int32 to float32 must be explicit: an implicit promotion loses bits of exact sums.
@@ -64,16 +64,12 @@ def optimised() -> Iterator[None]:
     jax.clear_caches()
 
 
-@pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sequences `flight` and `second`, and `tracks.csv` of the first; no test changes it."""
-    return make_once(tmp_path_factory, "two_flights", make_two_flights)
+#: A folder with the sequences `flight` and `second`, and `tracks.csv` of the first; no test changes it.
+world = made_once("two_flights", make_two_flights)
 
 
-@pytest.fixture(scope="session")
-def flight(world: Path) -> Path:
-    """A recording of two drones by three cameras."""
-    return world / "flight"
+#: The first of them: a recording of two drones by three cameras.
+flight = made_once("two_flights", make_two_flights, "flight")
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import cv2
 import jax
@@ -118,6 +118,11 @@ class Output(NamedTuple):
     out: str
     err: str
 
+    def ended(self, code: int = 0) -> Self:
+        """What a command gave that must end with this exit code."""
+        assert self.code == code, self
+        return self
+
 
 #: What runs a command, given its words.
 Run = Callable[..., Output]
@@ -148,6 +153,11 @@ def assert_refused(bad: Callable[[], object], *words: object, unchanged: Path) -
     for word in words:
         assert str(word) in line, line
     assert content_of(unchanged) == before
+
+
+def calls(function: Callable[..., object], *arguments: Any, **options: Any) -> Callable[..., Callable]:
+    """What prepares a bad call that needs neither the folder of a test nor a command."""
+    return lambda folder, run: lambda: function(*arguments, **options)
 
 
 def content_of(folder: Path) -> dict[str, bytes | None]:
@@ -215,6 +225,16 @@ def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
             make(folder)
             finished.write_text(maker)
         assert finished.read_text() == maker, f"two worlds of the tests have the name {name}"
+    return folder
+
+
+def made_once(name: str, make: Callable[[Path], object], inside: str = "") -> Any:
+    """A fixture: the folder of `make_once`, or what is inside of it."""
+
+    @pytest.fixture(scope="session")
+    def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return make_once(tmp_path_factory, name, make) / inside
+
     return folder
 
 

@@ -1,9 +1,6 @@
 """Rooms with markers, the cameras that look at them, what these detect, and the files of a drawn flight."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -195,7 +192,7 @@ def draw_markers(corners_m, camera):
     return cv2.cvtColor(draw(shown, size_wh=size_wh, fine=4), cv2.COLOR_GRAY2BGR)
 
 
-def make_drawn_flight(folder: Path) -> Path:
+def make_drawn_flight(folder):
     """Write `flight.avi`, its `images`, the lens, `lens.toml`, and the markers' corners, `corners.csv`."""
     write_marker_corners(folder / "corners.csv", wall_markers())
     write_rig(folder / "lens.toml", make_rig({"front": DRAWN_LENS}))
@@ -212,7 +209,7 @@ def make_drawn_flight(folder: Path) -> Path:
     return folder
 
 
-def write_onboard_sequence(drawn: Path, folder: Path) -> Path:
+def write_onboard_sequence(drawn, folder):
     """Write a sequence in the dataset's layout, where the videos of two drones' own cameras are the drawn flight's."""
     make_simulated(folder)
     for number in (1, 2):

@@ -6,7 +6,6 @@ import os
 import struct
 import zipfile
 import zlib
-from pathlib import Path
 
 import archives_made
 import cv2
@@ -270,68 +269,64 @@ WIDTH, HEIGHT = 24, 16
 PICTURE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
 
 
-def encoded(suffix: str, *flags: int) -> bytes:
+def encoded(suffix, *flags):
     there, data = cv2.imencode(suffix, PICTURE, flags)
     assert there
     return data.tobytes()
 
 
-def with_bytes(data: bytes, at: int, new: bytes) -> bytes:
+def with_bytes(data, at, new):
     return data[:at] + new + data[at + len(new) :]
 
 
-def png(width: int, height: int) -> bytes:
+def png(width, height):
     data = encoded(".png")
     start = data.index(b"IHDR")
     header = with_bytes(data[start : start + 17], 4, struct.pack(">II", width, height))
     return with_bytes(data, start, header + struct.pack(">I", zlib.crc32(header)))
 
 
-def jpeg(width: int, height: int, *flags: int, frame: bytes = b"\xff\xc0") -> bytes:
+def jpeg(width, height, *flags, frame=b"\xff\xc0"):
     data = encoded(".jpg", *flags)
     return with_bytes(data, data.index(frame) + 5, struct.pack(">HH", height, width))
 
 
-def progressive_jpeg(width: int, height: int) -> bytes:
+def progressive_jpeg(width, height):
     return jpeg(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, 1, frame=b"\xff\xc2")
 
 
-def jpeg_with_a_comment(width: int, height: int) -> bytes:
+def jpeg_with_a_comment(width, height):
     """A comment that looks like the header of a small frame, junk, and a fill byte, as decoders accept them."""
     comment = b"\xff\xc0\0\x11\x08\0\1\0\1"
     data = jpeg(width, height)
     return data[:2] + b"\xff\xfe" + struct.pack(">H", 2 + len(comment)) + comment + b"junk\xff" + data[2:]
 
 
-def bmp(width: int, height: int) -> bytes:
+def bmp(width, height):
     return with_bytes(encoded(".bmp"), 18, struct.pack("<ii", width, -height))
 
 
-def bmp_of_runs(width: int, height: int) -> bytes:
+def bmp_of_runs(width, height):
     """Runs of equal pixels (RLE8): the end of the image in two bytes."""
     header = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 8, 1, 0, 0, 0, 256, 0)
     return b"BM" + struct.pack("<IHHI", 1080, 0, 0, 1078) + header + bytes(1024) + b"\0\1"
 
 
-def tiff(width: int, height: int, order: str = "<") -> bytes:
+def tiff(width, height, order="<"):
     tags = [(256, width), (257, height), (258, 8), (259, 1), (262, 1), (273, 200), (277, 1), (278, height)]
     entries = b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags)
     start = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags))
     return (start + entries).ljust(200, b"\0") + bytes(1000)
 
 
-def pnm(width: int, height: int) -> bytes:
+def pnm(width, height):
     return b"P6\n# 1 1\n%d #\n %d\n255\n" % (width, height) + bytes(1152)
-
-
-def tiff_of_motorola(width: int, height: int) -> bytes:
-    return tiff(width, height, order=">")
 
 
 #: What writes an image of a claimed size.
 IMAGES = [png, jpeg, progressive_jpeg, jpeg_with_a_comment, bmp, pnm]
 #: What writes the beginning of one.
-BEGINNINGS = [bmp_of_runs, tiff, tiff_of_motorola]
+BEGINNINGS = [bmp_of_runs, tiff, lambda *size: tiff(*size, order=">")]
 
 
 @pytest.mark.parametrize("make", IMAGES + BEGINNINGS)
@@ -409,7 +404,7 @@ def test_an_image_of_another_format(tmp_path):
     assert_refused(lambda: read_image(path), found, unchanged=tmp_path)
 
 
-def little_video(path: Path, codec: str) -> bytes:
+def little_video(path, codec):
     """Write three frames; the file's content."""
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), 25.0, (64, 48))
     for _ in range(3):
@@ -418,14 +413,14 @@ def little_video(path: Path, codec: str) -> bytes:
     return path.read_bytes()
 
 
-def raw_avi(path: Path, width: int, height: int) -> None:
+def raw_avi(path, width, height):
     """A video of raw images, of which the header, and the header of its stream, claim a size."""
     data = little_video(path, "I420")
     data = with_bytes(data, data.index(b"avih") + 8 + 32, struct.pack("<II", width, height))
     path.write_bytes(with_bytes(data, data.index(b"strf") + 8 + 4, struct.pack("<ii", width, height)))
 
 
-def avi_of_jpegs(path: Path, width: int, height: int) -> None:
+def avi_of_jpegs(path, width, height):
     """A small video, of which one image claims to be huge."""
     parts = little_video(path, "MJPG").split(b"\xff\xc0")
     assert len(parts) == 4
@@ -499,8 +494,7 @@ def test_a_network_of_terabytes(tmp_path):
     path, shape = tmp_path / "net.onnx", np.array([1000, 1000, 1000, 1000], np.int64)
     node = onnx_models._node("ConstantOfShape", ["shape"], "output")
     path.write_bytes(onnx_models.model([node], {"shape": shape}, (1, 3, 64, 64), (1, 1, 1, 1)))
-
-    def detect():
-        OnnxDetector(path, DetectorSettings(size=64)).boxes(np.zeros((64, 64, 3), np.uint8))
-
-    assert_refused(detect, "net.onnx: expected", unchanged=tmp_path)
+    image, settings = np.zeros((64, 64, 3), np.uint8), DetectorSettings(size=64)
+    assert_refused(
+        lambda: OnnxDetector(path, settings).boxes(image), "net.onnx: expected", unchanged=tmp_path
+    )

@@ -24,7 +24,7 @@ ARM_M = np.array([0.03, -0.02, -0.117])
 LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 
 
-def turning_flight(num_frames: int = 400):
+def turning_flight(num_frames=400):
     """Estimate and reference of a drone that flies and turns; the tracked point is at the end of the lever arm."""
     rng = np.random.default_rng(0)
     frame = np.arange(num_frames)

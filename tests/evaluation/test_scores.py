@@ -36,7 +36,7 @@ def check(evaluation, tolerance=ROUNDING, **expected):
     }
 
 
-def turning(yaw_deg, **others) -> Trajectories:
+def turning(yaw_deg, **others):
     """Trajectories of one drone that stays at one place and turns about the vertical."""
     still = on_x_axis([0] * len(yaw_deg))
     about_z = Rotation.from_euler("z", np.array(yaw_deg, float)[:, None], degrees=True)
@@ -383,14 +383,14 @@ def test_correct_covariances_have_the_expected_nees():
 # --- other packages
 
 
-def crowded_flights(seed: int) -> tuple[Trajectories, Trajectories]:
+def crowded_flights(seed):
     """Flights within a metre, so that many pairs are possible; some estimates are missing, but no reference."""
     est, _ = random_flights(seed, num_frames=12)
     _, ref = random_flights(seed, num_frames=12, missing=0)
     return est, ref
 
 
-def separate_flights(seed: int) -> tuple[Trajectories, Trajectories]:
+def separate_flights(seed):
     """Flights 3 m apart, with missing positions, identity switches, distances beyond the gate and a false track."""
     rng = np.random.default_rng(seed)
     num_frames, num_drones = 20, 4
@@ -417,7 +417,7 @@ def separate_flights(seed: int) -> tuple[Trajectories, Trajectories]:
     return est, Trajectories(frame, frame / FPS, tuple("wxyz"), ref_m)
 
 
-def frames(est: Trajectories, ref: Trajectories):
+def frames(est, ref):
     """Iterate over frames: numbers of the known drones, numbers of the present estimates, and their distances."""
     for frame in range(ref.num_frames):
         drones = np.flatnonzero(ref.seen[frame])
@@ -427,7 +427,7 @@ def frames(est: Trajectories, ref: Trajectories):
         yield drones, estimates, np.linalg.norm(ref_m[:, None] - est_m, axis=-1)
 
 
-def for_trackeval(est: Trajectories, ref: Trajectories):
+def for_trackeval(est, ref):
     """Input of trackeval's metrics, with the similarity 1 - distance / `GATE_M`."""
     drones, estimates, distances_m = zip(*frames(est, ref), strict=True)
     return {

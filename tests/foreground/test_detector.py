@@ -44,7 +44,7 @@ def models(tmp_path_factory):
     return folder
 
 
-def square(size: int, column: int, row: int):
+def square(size, column, row):
     """xyxy of one of the network's squares in the image; the grey border above the image is an eighth of the input."""
     x0 = SCALE * STRIDE * column
     y0 = SCALE * (STRIDE * row - size // 8)

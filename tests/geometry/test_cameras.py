@@ -8,15 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from board_rigs import record_detections
-from helpers import (
-    assert_refused,
-    float32,
-    make_unnamed_rig,
-    opencv_pixels,
-    posed,
-    simple_lens,
-    sphere_points,
-)
+from helpers import assert_refused, float32, opencv_pixels, posed, simple_lens, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -299,7 +291,8 @@ FRAMES = 40
 def rig_of(centres_m, targets_m, focal_px=1000.0, dist=()):
     """Cameras at places that look at targets."""
     lens = simple_lens(focal_px, (1920, 1080), dist)
-    return make_unnamed_rig(*(posed(lens, *look) for look in zip(centres_m, targets_m, strict=True)))
+    looks = enumerate(zip(centres_m, targets_m, strict=True))
+    return make_rig({f"{number}": posed(lens, *look) for number, look in looks})
 
 
 def around(target_m):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives_made import OLD
-from helpers import assert_refused, files_up_to, make_once
+from helpers import assert_refused, files_up_to, made_once, make_once
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -28,10 +28,8 @@ CONTENT = OLD.read_bytes()
 FILES = {"tracks.csv": b"frame,drone,x_m,y_m,z_m\n", "tracks.json": b"{}"}
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """The folder of the old archive; tests must not change it."""
-    return make_once(tmp_path_factory, "old", lambda folder: unpack(OLD, folder / "S02_D4_A")) / "S02_D4_A"
+#: The folder of the old archive; tests must not change it.
+flight = made_once("old", lambda folder: unpack(OLD, folder / "S02_D4_A"), "S02_D4_A")
 
 
 @pytest.fixture
@@ -320,16 +318,12 @@ def test_some_frames_and_some_cameras_have_the_silhouettes_of_all(flight):
 # --- what is refused
 
 
-def no_record(folder):
-    (folder / "tracks.json").unlink()
-
-
 #: What happens to a folder, and words of the line.
 UNFIT = [
     (swap_silhouettes, "other content of cam1"),
     (partial(replace_text, old="[cameras.cam8]", new="[cameras.other]"), "no camera cam8"),
     (partial(replace_text, old="fps = 25.0", new="fps = 30.0"), "10 frames at 30 Hz"),
-    (no_record, "expected the record of the tracks"),
+    (lambda folder: (folder / "tracks.json").unlink(), "expected the record of the tracks"),
     (drop_last_frame, "tracks.csv: expected 10 frames, as tracks.json says, found 9"),
 ]
 
@@ -458,8 +452,7 @@ def test_tracks_are_computed_again_bit_by_bit(run_psotrack, tmp_path_factory, tm
     else:
         track += ["--init", place / "start.csv"]
     options = RUNS[name].split()
-    done = run_psotrack(*track, *options, "--particles", 15, "--iterations", 10, "--quiet")
-    assert done.code == 0, done.err
+    run_psotrack(*track, *options, "--particles", 15, "--iterations", 10, "--quiet").ended()
     assert run_psotrack(*pack).code == 0
     tracks = place.rename(tmp_path / "moved") / "tracks.csv"
 

@@ -39,12 +39,12 @@ def tracks_with(*changes):
     return replace(make_tracks(), status=status)
 
 
-def recording_of(rig, **fields) -> Recording:
+def recording_of(rig, **fields):
     times = dict.fromkeys(rig.names, FrameTimes(NUM_FRAMES, RATE_HZ)) | fields.pop("times", {})
     return Recording("lab", Path("lab"), cameras_of(rig, times=times, **fields))
 
 
-def flight_with(record, recording=None) -> TrackedFlight:
+def flight_with(record, recording=None):
     """Tracks with a record."""
     (tracks,) = flight_of(tracks_with()).tracks
     return TrackedFlight("lab", (replace(tracks, record=as_run_record(record, "tracks")),), recording)
@@ -208,7 +208,7 @@ def test_exported_tracks_beside_a_file_are_no_record(tmp_path):
 
 # --- what is refused
 
-#: Name of a file of tracks that `place` makes -> the record beside it.
+#: Name of a file of tracks -> the record beside it.
 RECORDS = {"other_types": '{"encounters": 3}', "of_a_barn": '{"sequence": "barn"}'}
 #: Command -> words of the line.
 BAD = {
@@ -230,9 +230,9 @@ BAD = {
 }
 
 
-@pytest.fixture
-def place(tmp_path, monkeypatch, world):
-    """The current folder, with files of tracks."""
+@pytest.mark.parametrize("command", BAD)
+def test_wrong_input_is_one_line(run_psotrack, world, tmp_path, monkeypatch, command):
+    """In a folder with files of tracks, without a screen."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.chdir(tmp_path)
@@ -243,10 +243,5 @@ def place(tmp_path, monkeypatch, world):
     write_trajectories("longer.csv", replace(tracks, time_s=10 * tracks.time_s))
     Path("longer.json").write_text("{}", encoding="utf-8")
     write_trajectories("late.csv", replace(tracks, time_s=tracks.time_s + 100))
-    return tmp_path
-
-
-@pytest.mark.parametrize("command", BAD)
-def test_wrong_input_is_one_line(run_psotrack, world, place, command):
     words = command.format(tracks=world / "tracks.csv", flight=world / "flight").split()
-    assert_refused(lambda: run_psotrack(*words), *BAD[command], unchanged=place)
+    assert_refused(lambda: run_psotrack(*words), *BAD[command], unchanged=tmp_path)
