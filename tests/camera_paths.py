@@ -1,23 +1,23 @@
 """Paths of cameras on drones, and tracks of the same drones by static cameras, with known errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from helpers import fading
 from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.inside_out import CameraPath, Flag, write_camera_path
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
 FPS = 25.0
+#: (3, 3), columns are the axes (right, down, ahead) of a camera that looks along the x axis of its body or the world.
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 #: From the camera to the middle of the drone, in the camera's axes.
 ARM_M = np.array([0.01, 0.03, -0.12])
 INSIDE_M, OUTSIDE_M = np.array([0.001, 0.001, 0.003]), np.array([0.004, 0.004, 0.004])
 
 
-def camera_path(position_m, rotation, covariance, *, first_s=0.0, num_markers=8) -> CameraPath:
+def camera_path(position_m, rotation, covariance, *, first_s=0.0, num_markers=8):
     """A path at 25 Hz with a pose in each frame."""
     count = len(position_m)
     return CameraPath(
@@ -34,18 +34,18 @@ def camera_path(position_m, rotation, covariance, *, first_s=0.0, num_markers=8)
     )
 
 
-def orientations(path: CameraPath) -> Rotation:
+def orientations(path):
     """The orientations of all frames, where a frame without a pose counts as not turned."""
     wxyz = np.where(path.seen[:, None], path.orientation_wxyz, [1.0, 0.0, 0.0, 0.0])
     return Rotation.from_quat(wxyz, scalar_first=True)
 
 
-def distances_m(path: CameraPath, position_m):
+def distances_m(path, position_m):
     """Distances from the true positions, NaN without a pose."""
     return np.linalg.norm(path.position_m - position_m, axis=1)
 
 
-def pose_errors(path: CameraPath, position_m, rotation):
+def pose_errors(path, position_m, rotation):
     """True minus estimated poses (frames, 6) in the covariance's order: along the world's axes, about the camera's."""
     turn = orientations(path).inv() * rotation
     return np.concatenate([position_m - path.position_m, turn.as_rotvec()], axis=1)
@@ -58,7 +58,7 @@ def squared_errors(error, covariance):
     return np.vecdot(error, solved[..., 0])
 
 
-def in_other_world(path: CameraPath, turn: Rotation, shift_m) -> CameraPath:
+def in_other_world(path, turn, shift_m):
     """The path with its poses in a world that is turned and shifted."""
     by_world = np.eye(6)
     by_world[:3, :3] = turn.as_matrix()
@@ -70,7 +70,7 @@ def in_other_world(path: CameraPath, turn: Rotation, shift_m) -> CameraPath:
     )
 
 
-def remove_poses(path: CameraPath, rows) -> CameraPath:
+def remove_poses(path, rows):
     """The path with the poses of some frames lost."""
     names = ("position_m", "orientation_wxyz", "covariance", "ambiguity", "reprojection_px")
     values = {name: getattr(path, name).copy() for name in (*names, "status", "num_markers")}
@@ -80,7 +80,7 @@ def remove_poses(path: CameraPath, rows) -> CameraPath:
     return replace(path, **values)
 
 
-def example_path(with_velocity: bool = True) -> CameraPath:
+def example_path(with_velocity=True):
     """Path of six frames with random poses and all kinds of status and flags; frame 5 has no pose."""
     rng, frame = np.random.default_rng(3), np.array([0, 1, 2, 4, 5, 6])
     root = rng.normal(size=(6, 6, 6))
@@ -98,7 +98,7 @@ def example_path(with_velocity: bool = True) -> CameraPath:
     return remove_poses(path, [4])
 
 
-def outside_tracks(middle_m, covariance_m2, first=0) -> Trajectories:
+def outside_tracks(middle_m, covariance_m2, first=0):
     """Tracks at 25 Hz of the middles (frames, drones, 3)."""
     frame = np.arange(first, first + len(middle_m))
     return Trajectories(
@@ -111,7 +111,7 @@ def outside_tracks(middle_m, covariance_m2, first=0) -> Trajectories:
     )
 
 
-def remove_positions(tracks: Trajectories, rows, drone=0) -> Trajectories:
+def remove_positions(tracks, rows, drone=0):
     """The tracks with some frames of one track lost."""
     status = tracks.status.copy()
     status[rows, drone] = Status.LOST
@@ -126,15 +126,6 @@ def smooth_flight(rng, num_frames, offset_s=0.0):
     knots_s = np.arange(-5.0, num_frames / FPS + 7.0)
     turns = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.4, size=(len(knots_s), 3)), axis=0))
     return 0.8 * waves + [0, 0, 2.0], Slerp(knots_s, turns)(time_s)
-
-
-def correlated_errors(rng, num_frames, time_s):
-    """Gauss-Markov errors with a variance of 1: (frames, 3)."""
-    left = np.exp(-1 / FPS / time_s)
-    values = rng.normal(size=(num_frames, 3))
-    for k in range(1, num_frames):
-        values[k] = left * values[k - 1] + np.sqrt(1 - left**2) * values[k]
-    return values
 
 
 #: Errors of both sources: standard deviations, metres, and factors on the stated ones; the parts of the variances that
@@ -154,8 +145,8 @@ def fly_twice_seen(seed, num_frames=150, num_drones=1, *, distance_m=4.0, **give
     rng = np.random.default_rng(seed)
 
     def errors(part, time_s):
-        white = rng.normal(size=(num_frames, 3))
-        return np.sqrt(1 - part) * white + np.sqrt(part) * correlated_errors(rng, num_frames, time_s)
+        white, noise = rng.normal(size=(2, num_frames, 3))
+        return np.sqrt(1 - part) * white + np.sqrt(part) * fading(noise, np.exp(-1 / FPS / time_s))
 
     paths, middles, truths = {}, [], []
     for drone in range(num_drones):
@@ -183,7 +174,7 @@ def fly_with_a_swap():
     return paths, outside, truths
 
 
-def make_paths_and_tracks(folder: Path) -> Path:
+def make_paths_and_tracks(folder):
     """Write the flight with a swap: `dron1.csv`, `dron2.csv`, `tracks.csv`, and files that do not belong to it."""
     paths, outside, _ = fly_with_a_swap()
     write_trajectories(folder / "tracks.csv", remove_positions(outside, slice(80, 90)))

@@ -1,9 +1,5 @@
 """Drones whose motion is known at any time, as a reference and as tracks with another clock, and files of both."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 from helpers import make_unnamed_rig
 
@@ -19,7 +15,7 @@ FPS = 25.0
 LATE_S = 0.4321
 
 
-def random_motion(number: int = 0, speed_m_s: float = 1.0):
+def random_motion(number=0, speed_m_s=1.0):
     """A function of times (...,) that returns positions (..., 3); the motion never repeats and has about this speed."""
     rng = np.random.default_rng(number)
     rate, phase = rng.uniform(0.4, 1.6, (4, 3)), rng.uniform(0, 2 * np.pi, (4, 3))
@@ -49,7 +45,7 @@ def simulate_reference(*paths, rate_hz=100.0, seconds=18.0):
     return time_s, np.stack([path(time_s) for path in paths], axis=1)
 
 
-def make_late_videos(root: Path) -> Path:
+def make_late_videos(root):
     """A real sequence with black videos, a .c3d file of 100 Hz that begins earlier, and `tracks.csv`."""
     folder = root / "Real_Data" / "R12_D2"
     folder.mkdir(parents=True)

@@ -36,7 +36,8 @@ from hypothesis import HealthCheck, settings
 if os.environ.get("PSOTRACK_TYPE_CHECKS") == "on":
     jaxtyping.install_import_hook("psotrack", "checked_types.checked")
 
-from helpers import Output
+from helpers import Output, made_once
+from worlds import make_two_flights
 
 # Conversions such as int32 to float32 must be explicit: an implicit promotion loses bits of exact sums.
 # Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
@@ -61,6 +62,14 @@ def optimised() -> Iterator[None]:
     yield
     jax.config.update("jax_disable_most_optimizations", True)
     jax.clear_caches()
+
+
+#: A folder with the sequences `flight` and `second`, and `tracks.csv` of the first; no test changes it.
+world = made_once("two_flights", make_two_flights)
+
+
+#: The first of them: a recording of two drones by three cameras.
+flight = made_once("two_flights", make_two_flights, "flight")
 
 
 @pytest.fixture

@@ -9,11 +9,21 @@ from psotrack.trajectories import Status, Trajectories
 
 #: Frames per second. Frames 0 and 1 are the first second, in which identity is fixed.
 FPS = 2.0
+#: Keys of the errors as JSON, which the contract promises.
+ERROR_KEYS = {
+    *("frames", "drones", "missed_rate", "id_switches", "mota", "motp_m", "idf1", "per_drone"),
+    *("mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
+    *("matched_mean_error_m", "offset_removed_mean_error_m"),
+    *("hota", "deta", "assa", "loca"),
+    *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
+    *("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg"),
+    *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
+}
 #: Tolerance for sums of a few float64 numbers of some metres, metres.
 ROUNDING = 1e-12
 
 
-def on_x_axis(*tracks, frame=None, **others) -> Trajectories:
+def on_x_axis(*tracks, frame=None, **others):
     """Trajectories of drones on the x axis; a track is a list of x in metres, or None where x is unknown."""
     x_m = np.array(tracks, float).T
     frame = np.arange(len(x_m)) if frame is None else np.array(frame)
@@ -32,13 +42,11 @@ def with_covariance(est, covariance_m2):
     return replace(est, covariance_m2=np.broadcast_to(np.array(covariance_m2, float), shape).copy())
 
 
-def random_flights(
-    seed: int, num_frames: int = 7, num_drones: int = 3, num_estimates: int = 4, missing: float = 0.15
-):
+def random_flights(seed, num_frames=7, num_drones=3, num_estimates=4, missing=0.15):
     """A random estimate and a random reference in a cube of 1 m, so small that drones are often mixed up."""
     rng = np.random.default_rng(seed)
 
-    def flights(drones: int, prefix: str) -> Trajectories:
+    def flights(drones, prefix):
         position_m = rng.uniform(-0.5, 0.5, (num_frames, drones, 3))
         position_m[rng.random((num_frames, drones)) < missing] = np.nan
         frame = np.arange(num_frames)
@@ -56,7 +64,7 @@ def random_flights(
 NUM_FRAMES = 50
 
 
-def circling_flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
+def circling_flights(num_drones=3, *, swap=False, names=()):
     """Estimate and reference of drones on circles.
 
     The estimate has an offset of 20 mm, and drone 2 is lost in frames 10 to 19. With `swap`, the first two tracks are

@@ -5,8 +5,9 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,11 +54,33 @@ def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
     A metre has `pixels_per_m` pixels. The origin projects to the middle of the image, which lies between two pixels if
     the side is even.
     """
-    R, t_m = look_at((0.0, -distance_m, 0.0), (0.0, 0.0, 0.0))
+    lens = simple_lens(pixels_per_m * distance_m, image_size_wh)
+    return posed(lens, (0.0, -distance_m, 0.0), (0.0, 0.0, 0.0))
+
+
+def simple_lens(focal_px, image_size_wh, dist=(), *, fisheye=False):
+    """A camera at the origin, whose axis meets the middle of the image."""
     width, height = image_size_wh
-    focal = pixels_per_m * distance_m
-    K = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
+    K = np.array([[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]])
+    pose = {"R": np.eye(3), "t_m": np.zeros(3)}
+    return make_camera(**pose, K=K, image_size_wh=image_size_wh, dist=dist, fisheye=fisheye)
+
+
+def posed(lens, centre_m, target_m, up=(0.0, 0.0, 1.0)):
+    """The camera at a place, looking at a point."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = look_at(tuple(centre_m), tuple(target_m), up=up)
+    return replace(lens, T_cam_world=T)
+
+
+def opencv_pixels(camera, points_m):
+    """(..., 2), the pixels in which OpenCV projects points (..., 3); it leaves out a skew."""
+    function = cv2.projectPoints if camera.fisheye is None else cv2.fisheye.projectPoints
+    T = camera.T_cam_world
+    turn, _ = cv2.Rodrigues(T[:3, :3])
+    flat = np.ascontiguousarray(points_m, float).reshape(-1, 1, 3)
+    pixels, _ = function(flat, turn, T[:3, 3], camera.K, np.array(camera.dist))
+    return pixels.reshape(*np.shape(points_m)[:-1], 2)
 
 
 def cameras_of(rig, **fields):
@@ -95,6 +118,11 @@ class Output(NamedTuple):
     out: str
     err: str
 
+    def ended(self, code: int = 0) -> Self:
+        """What a command gave that must end with this exit code."""
+        assert self.code == code, self
+        return self
+
 
 #: What runs a command, given its words.
 Run = Callable[..., Output]
@@ -127,6 +155,11 @@ def assert_refused(bad: Callable[[], object], *words: object, unchanged: Path) -
     assert content_of(unchanged) == before
 
 
+def calls(function: Callable[..., object], *arguments: Any, **options: Any) -> Callable[..., Callable]:
+    """What prepares a bad call that needs neither the folder of a test nor a command."""
+    return lambda folder, run: lambda: function(*arguments, **options)
+
+
 def content_of(folder: Path) -> dict[str, bytes | None]:
     """Path of each file below a folder, hidden files included, -> its bytes; path of each folder -> None."""
     return {
@@ -153,6 +186,15 @@ def files_up_to(num_bytes: int) -> Iterator[None]:
 def environment_without_jax_settings() -> dict[str, str]:
     """Environment variables for a command that must not use the suite's folder of compiled programs."""
     return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+
+
+#: `psotrack` as at a terminal: shells start programs in the background with Ctrl-C ignored.
+AT_A_TERMINAL = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from psotrack.__main__ import main
+main()
+"""
 
 
 def listening_at(process: int) -> set[str]:
@@ -186,6 +228,16 @@ def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
     return folder
 
 
+def made_once(name: str, make: Callable[[Path], object], inside: str = "") -> Any:
+    """A fixture: the folder of `make_once`, or what is inside of it."""
+
+    @pytest.fixture(scope="session")
+    def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        return make_once(tmp_path_factory, name, make) / inside
+
+    return folder
+
+
 def float32(tree):
     """Convert a pytree to JAX float32 arrays, the type in which the tracker computes."""
 
@@ -209,6 +261,14 @@ def assert_same(actual, desired, atol=0.0):
     assert jax.tree.structure(actual) == jax.tree.structure(desired)
     for actual_leaf, desired_leaf in zip(jax.tree.leaves(actual), jax.tree.leaves(desired), strict=True):
         np.testing.assert_allclose(actual_leaf, desired_leaf, rtol=0, atol=atol)
+
+
+def fading(noise, persistence):
+    """Noise of variance 1, as a stationary first-order autoregression along the first axis."""
+    noise = noise.copy()
+    for row in range(1, len(noise)):
+        noise[row] = persistence * noise[row - 1] + np.sqrt(1 - persistence**2) * noise[row]
+    return noise
 
 
 def sphere_points(count):

@@ -1,20 +1,17 @@
 """Rooms with markers, the cameras that look at them, what these detect, and the files of a drawn flight."""
 
-from __future__ import annotations
-
 import shutil
-from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 from dpjait_folders import make_simulated
+from helpers import posed, simple_lens
 from marker_pictures import draw
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import lens_of_view
 from psotrack.foreground.markers import DetectedMarkers
-from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry import make_rig, project
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter
 from psotrack.recordings.datasets import write_marker_corners
@@ -24,22 +21,8 @@ SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -
 RATE_HZ = 25.0
 
 
-def simple_lens(focal_px, size_wh, dist=()):
-    """A camera at the origin, whose axis meets the middle of the image."""
-    width, height = size_wh
-    K = np.array([[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]])
-    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh, dist=dist)
-
-
 #: A camera with a little distortion.
 LENS = simple_lens(900.0, (1280, 720), (-0.08, 0.02, 0.0004, -0.0003))
-
-
-def posed(lens, centre_m, target_m):
-    """The camera at a place, looking at a point."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = look_at(tuple(centre_m), tuple(target_m))
-    return replace(lens, T_cam_world=T)
 
 
 def marker_at(centre_m, front, turn_deg=0.0, *, side_m=0.3):
@@ -209,7 +192,7 @@ def draw_markers(corners_m, camera):
     return cv2.cvtColor(draw(shown, size_wh=size_wh, fine=4), cv2.COLOR_GRAY2BGR)
 
 
-def make_drawn_flight(folder: Path) -> Path:
+def make_drawn_flight(folder):
     """Write `flight.avi`, its `images`, the lens, `lens.toml`, and the markers' corners, `corners.csv`."""
     write_marker_corners(folder / "corners.csv", wall_markers())
     write_rig(folder / "lens.toml", make_rig({"front": DRAWN_LENS}))
@@ -226,7 +209,7 @@ def make_drawn_flight(folder: Path) -> Path:
     return folder
 
 
-def write_onboard_sequence(drawn: Path, folder: Path) -> Path:
+def write_onboard_sequence(drawn, folder):
     """Write a sequence in the dataset's layout, where the videos of two drones' own cameras are the drawn flight's."""
     make_simulated(folder)
     for number in (1, 2):

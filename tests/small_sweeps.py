@@ -3,12 +3,9 @@
 import json
 import os
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import pandas as pd
-import pytest
-from helpers import make_once
+from helpers import made_once
 
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.sweeps import sweep
@@ -36,19 +33,19 @@ swarm.iterations = {{iterations}}
 COMPILER = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=1"}
 
 
-def grid_file(folder: Path, iterations: list[int], runs: int = 1) -> Path:
+def grid_file(folder, iterations, runs=1):
     """Write a grid with one cell per number of iterations."""
     path = folder / f"grid_{len(iterations)}_{runs}.toml"
     path.write_text(GRID.format(iterations=iterations, runs=runs))
     return path
 
 
-def environment(root: Path) -> dict[str, str]:
+def environment(root):
     """Environment of commands that use the cache in the small sequence's folder."""
     return os.environ | COMPILER | {"PSOTRACK_CACHE": str(root / "cache")}
 
 
-def wait_until(happened: Callable[[], object]) -> None:
+def wait_until(happened):
     """Wait until `happened()` is true; the limit of five minutes is for tests that hang, not for slow machines."""
     end_s = time.monotonic() + 300
     while not happened():
@@ -56,27 +53,24 @@ def wait_until(happened: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
-def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data folder with a sequence of two drones, and caches with its silhouettes and its compiled program.
-
-    The folder is made once per session, so that a run in a test takes seconds.
-    """
-
-    def make(root: Path) -> None:
-        simulate("S01_D2_A", root, SimulationSettings(num_frames=6, scale=0.25, onboard=False), jobs=1)
-        swept = sweep(grid_file(root, [2]), root / "warm_results", data=root, cache=root / "cache", jobs=1)
-        assert swept.count("finished") == 1, swept.errors
-
-    return make_once(tmp_path_factory, "small_sequence", make)
+def make_small_sequence(root):
+    """A data folder with a sequence of two drones, and caches with its silhouettes and its compiled program."""
+    simulate("S01_D2_A", root, SimulationSettings(num_frames=6, scale=0.25, onboard=False), jobs=1)
+    swept = sweep(grid_file(root, [2]), root / "warm_results", data=root, cache=root / "cache", jobs=1)
+    assert swept.count("finished") == 1, swept.errors
 
 
-def all_rows(results: Path) -> pd.DataFrame:
+#: A fixture: the folder is made once per session, so that a run in a test takes seconds.
+small_sequence = made_once("small_sequence", make_small_sequence)
+
+
+def all_rows(results):
     """Rows of every finished cell, read without psotrack."""
     files = [path for path in (results / "cells").glob("*.parquet") if not path.name.startswith(".")]
     return pd.concat([pd.read_parquet(path) for path in files], ignore_index=True)
 
 
-def stamps(results: Path) -> dict[str, tuple[int, bytes]]:
+def stamps(results):
     """Inode and content of each finished cell's file; a use changes the file's time."""
     found = [path for path in (results / "cells").glob("*.parquet") if path.name[0] != "."]
     return {path.name: (path.stat().st_ino, path.read_bytes()) for path in found}

@@ -10,8 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
-from helpers import make_once, ring_rig
+from helpers import ring_rig
 
 from psotrack.geometry import project
 from psotrack.geometry.rig_files import write_rig
@@ -91,12 +90,8 @@ def make_tracks_file(path: Path, error_m: float = 0.01) -> Path:
     return path
 
 
-def two_flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sequences `flight` and `second`, and `tracks.csv` of the first; no test changes it."""
-
-    def make(folder: Path) -> None:
-        make_sequence(folder / "flight")
-        make_sequence(folder / "second")
-        make_tracks_file(folder / "tracks.csv")
-
-    return make_once(tmp_path_factory, "two_flights", make)
+def make_two_flights(folder: Path) -> None:
+    """Fill a folder with the sequences `flight` and `second`, and `tracks.csv` of the first."""
+    make_sequence(folder / "flight")
+    make_sequence(folder / "second")
+    make_tracks_file(folder / "tracks.csv")

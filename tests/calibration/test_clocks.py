@@ -3,11 +3,10 @@
 import json
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from clock_worlds import FPS, LATE_S, make_late_videos, random_motion, simulate_estimate, simulate_reference
-from helpers import make_once, ring_rig
+from helpers import fading, make_once, opencv_pixels, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -15,14 +14,6 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration.clocks import camera_offsets
 from psotrack.evaluation import find_offset
 from psotrack.trajectories import UNASSIGNED
-
-
-def correlated(noise, correlation):
-    """Noise of standard deviation 1, as a first-order autoregression along the first axis."""
-    noise = noise.copy()
-    for row in range(1, len(noise)):
-        noise[row] = correlation * noise[row - 1] + np.sqrt(1 - correlation**2) * noise[row]
-    return noise
 
 
 def find(estimate, *paths, max_offset_s=0.5, **options):
@@ -96,7 +87,7 @@ def test_the_true_offset_is_within_two_standard_deviations(errors):
         if errors == "independent":
             error_m = 0.02 * noise
         elif errors == "correlated":
-            error_m = 0.02 * correlated(noise, 0.95)
+            error_m = 0.02 * fading(noise, 0.95)
         else:
             error_m = turning_error(rng, estimate.time_s) + 0.005 * noise
         found = find(replace(estimate, position_m=estimate.position_m + error_m), *paths)
@@ -157,11 +148,8 @@ def detected_points(rig, paths, offsets_frames, num_frames=200, seed=0, **errors
     points_px = np.full((num_frames, len(paths), len(rig), 2), np.nan)
     for number, offset_frames in enumerate(offsets_frames):
         time_s = (np.arange(num_frames) + offset_frames) / FPS
-        one = rig.cameras[number]
-        turn, _ = cv2.Rodrigues(one.T_cam_world[:3, :3])
         for drone, path in enumerate(paths):
-            pixels, _ = cv2.projectPoints(path(time_s), turn, one.T_cam_world[:3, 3], one.K, one.dist)
-            points_px[:, drone, number] = pixels[:, 0]
+            points_px[:, drone, number] = opencv_pixels(rig.cameras[number], path(time_s))
     return points_px
 
 
@@ -233,7 +221,7 @@ def test_the_true_offsets_of_cameras_are_within_two_standard_deviations(errors):
         points_px = with_errors(exact_px, noise_px=0.5, seed=seed)
         noise = rng.normal(size=points_px.shape)
         if errors == "correlated":
-            points_px += 1.5 * correlated(noise, 0.9)
+            points_px += 1.5 * fading(noise, 0.9)
         elif errors == "calibration":
             points_px += 2 * noise[0, 0]
         found = camera_offsets(RIG, points_px, FPS)
@@ -275,8 +263,7 @@ def test_hovering_drones_and_cameras_that_see_nothing_leave_offsets_uncertain(po
 def test_the_doctor_finds_the_clock_of_the_reference(run_psotrack, tmp_path_factory):
     root = make_once(tmp_path_factory, "late_videos", make_late_videos)
     words = ("doctor", root / "Real_Data" / "R12_D2", "--tracks", root / "tracks.csv", "--max-offset", 1)
-    done = run_psotrack(*words)
-    assert done.code == 0, done.err
+    done = run_psotrack(*words).ended()
     assert done.out.startswith("R12_D2: the reference's clock is 0.43")
     assert "ahead of the videos'" in done.out
     assert "(+10." in done.out

@@ -450,8 +450,7 @@ def test_sightings_that_agree_by_chance_do_not_go_on_from_frame_to_frame():
 @pytest.mark.slow
 def test_the_command(run_psotrack, tmp_path):
     folder = record_detections(tmp_path / "correct", INDOORS.seen, RIG)
-    done = run_psotrack("doctor", folder)
-    assert done.code == 0, done.err
+    done = run_psotrack("doctor", folder).ended()
     assert "nothing disagrees" in done.out
     found = pt.doctor(folder)
     assert repr(found) == "Diagnosis(nothing disagrees)"
@@ -459,13 +458,10 @@ def test_the_command(run_psotrack, tmp_path):
 
     wrong, *_ = FAULTS["centres"]
     folder = record_detections(tmp_path / "with_centres", INDOORS.seen, wrong)
-    done = run_psotrack("doctor", folder, "-q")
-    assert done.code == 1
+    done = run_psotrack("doctor", folder, "-q").ended(1)
     assert done.out.count("\n") == 1
     assert "write t = -R C" in done.out
-    done = run_psotrack("doctor", folder, "--json", "-")
-    assert done.code == 1
-    content = json.loads(done.out)
+    content = json.loads(run_psotrack("doctor", folder, "--json", "-").ended(1).out)
     found = pt.doctor(folder).to_dict()
     assert json.loads(json.dumps(found)) == content
     assert [finding["kind"] for finding in content["findings"]] == ["translation or centre"]

@@ -5,34 +5,29 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES
+from helpers import LENSES, posed, simple_lens
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.calibration import locate_camera, ray_distances, solve_pnp, solve_pnp_ransac
-from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry import project
 
-K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
-LENS = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=(1920, 1080))
-
-
-def camera_at(centre_m, target_m, K=K, **lens):
-    R, t_m = look_at(centre_m, target_m)
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), **lens)
+FULL_HD = (1920, 1080)
+LENS = simple_lens(1157.0, FULL_HD)
 
 
 def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=()):
     """A camera 5 m from its target, and points at random depths, one in each cell of a grid of its image."""
-    angle = rng.uniform(0, 2 * np.pi)
-    camera = camera_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0), dist=dist)
+    angle, lens = rng.uniform(0, 2 * np.pi), simple_lens(1157.0, FULL_HD, dist)
+    camera = posed(lens, (5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0))
     number = np.arange(count)
     cells = np.stack([number // 3 % 4, number % 3], axis=-1)
     pixels = (cells + rng.uniform(0.1, 0.9, (count, 2))) * (480, 360)
     depth_m = rng.uniform(nearest_m, farthest_m, (count, 1))
     # Distortion moves the pixels of the points a little; they only need to be near the middles of the cells.
-    in_camera = np.append((pixels - K[:2, 2]) / 1157.0, np.ones((count, 1)), axis=1) * depth_m
+    in_camera = np.append((pixels - LENS.K[:2, 2]) / 1157.0, np.ones((count, 1)), axis=1) * depth_m
     return camera, to_world(camera, in_camera)
 
 
@@ -64,8 +59,8 @@ WIDE = {
 @pytest.mark.parametrize(("dist", "fisheye"), WIDE.values(), ids=WIDE)
 def test_exact_points_give_the_pose_through_a_wide_lens(dist, fisheye):
     """Points up to 70 degrees from the axis; one pixel lies where the lens shows nothing."""
-    wide_K = np.array([[480.0, 0, 959.5], [0, 480.0, 539.5], [0, 0, 1]])
-    camera = camera_at((4.0, -3.0, 2.0), (0.0, 0.0, 1.0), wide_K, dist=dist, fisheye=fisheye)
+    lens = simple_lens(480.0, FULL_HD, dist, fisheye=fisheye)
+    camera = posed(lens, (4.0, -3.0, 2.0), (0.0, 0.0, 1.0))
     angle = np.radians(np.tile([10.0, 40.0, 55.0, 70.0], 3))
     around = np.arange(12) * 2.4
     x = np.sin(angle) * np.cos(around)
@@ -142,7 +137,7 @@ def test_the_truth_is_where_the_covariance_says_by_any_noise_and_lens(noise_px, 
 
 def test_points_in_a_plane_determine_the_pose():
     rng = np.random.default_rng(7)
-    camera = camera_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
+    camera = posed(LENS, (4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
     points = rng.uniform(-1.5, 1.5, (12, 3)) * [1, 1, 0]
     located = locate_camera(points, noisy_pixels(camera, points, rng), LENS)
     _, distance = off_centre(located, camera)
@@ -173,16 +168,12 @@ def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
 
 def world(rng, count, *, flat=False):
     """A camera 4 m from points, flat or not, in an oblique plane, and where it sees them."""
-    T = camera_at((3.0, -2.0, 2.0), (0.0, 0.0, 0.5)).T_cam_world
+    T = posed(LENS, (3.0, -2.0, 2.0), (0.0, 0.0, 0.5)).T_cam_world
     points_m = rng.uniform(-1, 1, (count, 3))
     if flat:
         points_m[:, 2] = 0.3 * points_m[:, 0] + 0.2
-    return T, points_m, rays_of(T, points_m)
-
-
-def rays_of(T, points_m):
     in_camera = points_m @ T[:3, :3].T + T[:3, 3]
-    return in_camera[:, :2] / in_camera[:, 2:]
+    return T, points_m, in_camera[:, :2] / in_camera[:, 2:]
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from board_rigs import (
     relative_to_first,
     row_of_cameras,
 )
+from helpers import make_unnamed_rig, posed, simple_lens
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -46,7 +47,7 @@ from psotrack.calibration import (
 from psotrack.calibration.lens_models import lenses_at_size
 from psotrack.calibration.rig.start import find_board_poses, fit_boards
 from psotrack.errors import InputError
-from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry import project
 from psotrack.recordings import Detections, FrameTimes
 
 RIG, FOUR = row_of_cameras(), row_of_cameras(4)
@@ -328,12 +329,8 @@ def test_cameras_with_a_small_field_of_view(seed):
     Regression: with a gate of 15 px alone, the first pose was off by degrees, on flights before real thermal cameras
     with these lenses too, and many sightings were left out.
     """
-    K = np.array([[1176.0, 0, 320], [0, 1176, 240], [0, 0, 1]])
-    cameras = {}
-    for name, x in (("left", -5.0), ("right", 5.0)):
-        R, t_m = look_at((x, 0.0, 1.0), (0.4 * x, 80.0, 30.0))
-        cameras[name] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(640, 480))
-    rig = make_rig(cameras)
+    lens = simple_lens(1176.0, (640, 480))
+    rig = make_unnamed_rig(*(posed(lens, (x, 0.0, 1.0), (0.4 * x, 80.0, 30.0)) for x in (-5.0, 5.0)))
     rng = np.random.default_rng(seed)
     angle = np.linspace(0, 60, 200)[:, None] * [0.5, 0.23, 0.37 + np.pi / 120] + rng.uniform(0, 6, 3)
     points_m = np.array([0.0, 85.0, 31.0]) + np.array([20.0, 15.0, 10.0]) * np.sin(angle)

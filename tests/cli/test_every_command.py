@@ -1,20 +1,16 @@
 """What all commands have: help, completion in shells, --progress, --log, --config and --save-config."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import click
 import cv2
 import numpy as np
 import pytest
-from helpers import Output, assert_refused
+from helpers import assert_refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,8 +20,6 @@ from psotrack.cli.output import Output as Printer
 from psotrack.cli.settings import config_text, read_config
 from psotrack.settings import TrackSettings
 from psotrack.trajectories import Status, Trajectories
-
-Run = Callable[..., Output]
 
 #: A line of a log: local time with its offset, level, and what was said.
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (info|warning|error) (.*)")
@@ -44,7 +38,7 @@ for words in sys.argv[1:]:
 """
 
 
-def commands_of(group: click.Group, typed: str) -> Iterator[tuple[str, click.Command]]:
+def commands_of(group, typed):
     """A group and every command in it, each with what is typed for it."""
     yield typed, group
     for name in group.list_commands(click.Context(group)):
@@ -75,7 +69,7 @@ cli.main()
 EVERY_COMMAND = dict(commands_of(cli.cli, "psotrack"))
 
 
-def test_summaries_are_the_first_sentences_of_the_commands(run_psotrack: Run) -> None:
+def test_summaries_are_the_first_sentences_of_the_commands(run_psotrack):
     """They are written a second time, because help must not import the commands."""
     groups = [command for command in EVERY_COMMAND.values() if isinstance(command, LazyGroup)]
     assert cli.cli in groups
@@ -85,8 +79,7 @@ def test_summaries_are_the_first_sentences_of_the_commands(run_psotrack: Run) ->
             command = group.commands[name]
             assert command.name == name
             assert group.summary(name) == command.get_short_help_str(limit=1000), name
-    result = run_psotrack("--help")
-    assert result.code == 0
+    result = run_psotrack("--help").ended()
     words = " ".join(result.out.split())
     for name in cli.cli.places:
         assert f" {name} {cli.cli.summary(name)}" in words
@@ -95,7 +88,7 @@ def test_summaries_are_the_first_sentences_of_the_commands(run_psotrack: Run) ->
 
 
 @pytest.mark.parametrize("words", EVERY_COMMAND)
-def test_help_fits_two_screens_and_has_an_example(words: str) -> None:
+def test_help_fits_two_screens_and_has_an_example(words):
     command = EVERY_COMMAND[words]
     context = click.Context(command, info_name=words, terminal_width=100, max_content_width=100)
     text = command.get_help(context)
@@ -106,7 +99,7 @@ def test_help_fits_two_screens_and_has_an_example(words: str) -> None:
 
 
 @pytest.mark.parametrize("words", EVERY_COMMAND)
-def test_help_names_the_default_that_an_option_has(words: str) -> None:
+def test_help_names_the_default_that_an_option_has(words):
     context = click.Context(EVERY_COMMAND[words], resilient_parsing=True)
     for option in EVERY_COMMAND[words].params:
         if not isinstance(option, click.Option) or option.is_eager:
@@ -125,7 +118,7 @@ def test_help_names_the_default_that_an_option_has(words: str) -> None:
             assert not any(re.fullmatch(r"[\d.]+", each) for each in stated), option.name
 
 
-def test_help_and_names_of_commands_import_no_heavy_package() -> None:
+def test_help_and_names_of_commands_import_no_heavy_package():
     """Help of a command imports the defaults of settings alone. What a line imports, the next ones have too."""
     light = ["", "--version", "calibrate"]
     with_settings = ["onboard localise", "simulate sequence", "detect", "sweep", "track"]
@@ -136,10 +129,10 @@ def test_help_and_names_of_commands_import_no_heavy_package() -> None:
     assert lines[3:] == ["msgspec"] * len(with_settings)
 
 
-def test_warnings_of_libraries_are_for_the_log_and_verbose(tmp_path: Path) -> None:
+def test_warnings_of_libraries_are_for_the_log_and_verbose(tmp_path):
     """In this process all warnings are errors, in all commands of all tests."""
 
-    def said(*words: object) -> str:
+    def said(*words):
         command = [sys.executable, "-c", WARN, *map(str, words), "simulate", "--list"]
         return subprocess.run(command, capture_output=True, text=True, check=True).stderr
 
@@ -152,32 +145,19 @@ def test_warnings_of_libraries_are_for_the_log_and_verbose(tmp_path: Path) -> No
 # --- completion
 
 
-@pytest.fixture
-def complete(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
-    """Runs `psotrack` as a shell does that wants completions."""
+def test_commands_and_options_are_completed(monkeypatch, run_psotrack, tmp_path):
+    """The script of a shell runs psotrack with what was typed in variables of the environment."""
 
-    def call(shell: str, **environment: str) -> Output:
+    def complete(shell, **environment):
         monkeypatch.setenv("_PSOTRACK_COMPLETE", shell)
         for name, value in environment.items():
             monkeypatch.setenv(name, value)
         return run_psotrack()
 
-    return call
-
-
-def test_an_unknown_shell_is_one_line(complete: Run, tmp_path: Path) -> None:
-    shells = "bash_source, zsh_source or fish_source"
-    assert_refused(lambda: complete("tcsh_source"), shells, unchanged=tmp_path)
-
-
-def test_commands_and_options_are_completed(complete: Run) -> None:
-    """The script of a shell runs psotrack with what was typed in variables of the environment."""
-
-    def completions(typed: str) -> list[str]:
+    def completions(typed):
         """Completions of the last word that is typed."""
         last = typed.count(" ")
-        result = complete("bash_complete", COMP_WORDS=typed, COMP_CWORD=str(last))
-        assert result.code == 0, result
+        result = complete("bash_complete", COMP_WORDS=typed, COMP_CWORD=str(last)).ended()
         return sorted(line.partition(",")[2] for line in result.out.splitlines())
 
     assert completions("psotrack s") == ["simulate", "sweep"]
@@ -185,20 +165,22 @@ def test_commands_and_options_are_completed(complete: Run) -> None:
     options = ["--scale", "--scenario", "--seed", "--set", "--show"]
     assert completions("psotrack simulate sequence --s") == options
     assert completions("psotrack onboard fuse --at ") == ["camera", "middle"]
+    shells = "bash_source, zsh_source or fish_source"
+    assert_refused(lambda: complete("tcsh_source"), shells, unchanged=tmp_path)
 
 
 # --- --progress, --log, --config and --save-config, and the table of `track`
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+def run(monkeypatch, run_psotrack):
     """Runs `psotrack` with some arguments, with the progress that users see."""
     monkeypatch.delenv("PSOTRACK_PROGRESS", raising=False)
     return run_psotrack
 
 
 @pytest.fixture
-def command(tmp_path: Path) -> list[object]:
+def command(tmp_path):
     """Arguments of a command that takes a moment: `onboard detect` in a photograph of a marker."""
     path = tmp_path / "photograph.png"
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 100)
@@ -206,18 +188,17 @@ def command(tmp_path: Path) -> list[object]:
     return ["onboard", "detect", path, "--out", tmp_path / "markers.csv", "--force", "--json", "-"]
 
 
-def said_in(log: Path) -> list[tuple[str, str]]:
+def said_in(log):
     """Level and text of each line of a log."""
     matches = [LINE.fullmatch(line) for line in log.read_text(encoding="utf-8").splitlines()]
     assert all(matches)
     return [(match[1], match[2]) for match in matches if match]
 
 
-def test_progress(run: Run, command: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress(run, command, monkeypatch):
     """Short work is quiet, lines say what was done, --quiet has precedence, and a variable chooses."""
     assert run(*command).err == run(*command, "--progress", "none").err == ""
-    code, out, err = run(*command, "--progress", "lines")
-    assert code == 0
+    _, out, err = run(*command, "--progress", "lines").ended()
     assert json.loads(out)
     assert re.fullmatch(r"psotrack: markers: 1 of 1 in \d+\.\d s\n", err)
     assert "1/1" in run(*command, "--progress", "bar").err
@@ -227,7 +208,7 @@ def test_progress(run: Run, command: list[object], monkeypatch: pytest.MonkeyPat
     assert run(*command, "--progress", "none").err == ""
 
 
-def test_a_log_grows(run: Run, command: list[object], tmp_path: Path) -> None:
+def test_a_log_grows(run, command, tmp_path):
     log = tmp_path / "logs" / "all.log"
     command = [*command[:5], "--log", log]
     out = run(*command).out
@@ -249,19 +230,17 @@ def test_a_log_grows(run: Run, command: list[object], tmp_path: Path) -> None:
     assert said_in(log)[-1][0] == "error"
 
 
-def test_results_and_folders_are_no_logs(run: Run, command: list[object], tmp_path: Path) -> None:
+def test_results_and_folders_are_no_logs(run, command, tmp_path):
     tracks = tmp_path / "tracks.csv"
     tracks.write_text("frame,drone\n", encoding="utf-8")
-    refusal = "expected a new file, or a log of psotrack"
-    assert_refused(lambda: run(*command, "--log", tracks), refusal, unchanged=tmp_path)
-    refusal = "a log file that can be written"
-    assert_refused(lambda: run(*command, "--log", tmp_path), refusal, unchanged=tmp_path)
+    words = {tracks: "expected a new file, or a log of psotrack", tmp_path: "a log file that can be written"}
+    for log in words:
+        assert_refused(lambda log=log: run(*command, "--log", log), words[log], unchanged=tmp_path)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_the_work_goes_on_where_the_log_meets_a_full_disk(run: Run, command: list[object]) -> None:
-    code, out, err = run(*command, "--log", "/dev/full")
-    assert code == 0
+def test_the_work_goes_on_where_the_log_meets_a_full_disk(run, command):
+    _, out, err = run(*command, "--log", "/dev/full").ended()
     assert json.loads(out)
     assert err == "psotrack: warning: /dev/full: No space left on device; the log ends here\n"
 
@@ -289,21 +268,19 @@ SETTINGS = st.fixed_dictionaries(
 # To read all settings takes a tenth of a second.
 @settings(max_examples=10)
 @given(values=SETTINGS)
-def test_a_saved_config_has_all_settings(tmp_path_factory: pytest.TempPathFactory, values: Any) -> None:
+def test_a_saved_config_has_all_settings(tmp_path_factory, values):
     saved = TrackSettings().changed(values)
     file = tmp_path_factory.getbasetemp() / "saved_config.toml"
     file.write_text(config_text(saved), encoding="utf-8")
     assert TrackSettings().changed(read_config(file)) == saved
 
 
-def test_a_run_that_fails_saves_no_config(run: Run, tmp_path: Path) -> None:
+def test_a_run_that_fails_saves_no_config(run, tmp_path):
     words = ("track", tmp_path, "--out", tmp_path / "t.csv", "--save-config", tmp_path / "b.toml")
     assert_refused(lambda: run(*words), unchanged=tmp_path)
 
 
-def test_the_table_of_drones_has_eighty_columns_and_no_cell_is_cut(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_table_of_drones_has_eighty_columns_and_no_cell_is_cut(capsys):
     long_name = "[red]a drone with a long name"
     frames = 40
     tracks = Trajectories(

@@ -4,7 +4,6 @@ import io
 import itertools
 import json
 import shlex
-import shutil
 import string
 import sys
 import unicodedata
@@ -38,17 +37,8 @@ tvec = [0, 0, 5]
 BOXES = "2,0,0,9,9,4,5,0.5\n"
 
 
-@pytest.fixture(scope="session")
-def video(tmp_path_factory):
-    path = tmp_path_factory.mktemp("video") / "small.avi"
-    with VideoWriter(path, 25.0, (64, 48)) as writer:
-        for index in range(4):
-            writer.write(np.full((48, 64, 3), 40 * index, np.uint8))
-    return path
-
-
 @pytest.fixture
-def folder(tmp_path, video):
+def folder(tmp_path):
     """Return a function that makes a folder with files of these names and a `rig.toml` of these cameras."""
 
     def make(*files, cameras=()):
@@ -63,7 +53,10 @@ def folder(tmp_path, video):
             elif file.suffix in (".csv", ".toml"):
                 file.write_text(BOXES if file.suffix == ".csv" else rig)
             else:
-                shutil.copy(video, file)
+                with VideoWriter(tmp_path / "small.avi", 25.0, (64, 48)) as writer:
+                    for index in range(4):
+                        writer.write(np.full((48, 64, 3), 40 * index, np.uint8))
+                (tmp_path / "small.avi").rename(file)
         return path
 
     return make
@@ -72,13 +65,7 @@ def folder(tmp_path, video):
 @pytest.fixture
 def init(run_psotrack):
     """Runs `init`, which must succeed: what it prints."""
-
-    def init(folder, *arguments):
-        done = run_psotrack("init", folder, *arguments)
-        assert done.code == 0, done
-        return done.out
-
-    return init
+    return lambda *words: run_psotrack("init", *words).ended().out
 
 
 @pytest.fixture
@@ -89,12 +76,6 @@ def refuses(run_psotrack):
         assert_refused(lambda: run_psotrack("init", folder, *options), *words, unchanged=folder)
 
     return refuses
-
-
-def videos_of(folder):
-    """The video of each camera that has one."""
-    cameras = read_recording_file(folder / "recording.toml").cameras
-    return {name: each.video for name, each in cameras.items()}
 
 
 @pytest.mark.parametrize(
@@ -265,7 +246,8 @@ def test_matches_by_hand(init, refuses, folder):
     )
     left_out = ("--leave-out", "GX 24.avi", "--leave-out", "take_cam1_cam2.avi")
     init(path, "--match", "Cam 1=GX010123.avi", *left_out, "--match", "cam3=rtsp://x/1")
-    assert videos_of(path) == {"cam1": "GX010123.avi", "cam2": "cam2.avi", "cam3": "rtsp://x/1"}
+    videos = {name: each.video for name, each in read_recording_file(path / "recording.toml").cameras.items()}
+    assert videos == {"cam1": "GX010123.avi", "cam2": "cam2.avi", "cam3": "rtsp://x/1"}
 
 
 # --- questions
@@ -301,8 +283,7 @@ UNCLEAR = ("GX01.avi", "GX02.avi", "test.avi", "boxes/first.csv")
 
 def test_all_files_are_asked_for_together(ask, folder):
     path = folder(*UNCLEAR, cameras=("left", "right"))
-    done = ask("init", path, "right", "nobody", "1", "-", "2")
-    assert done.code == 0, done
+    done = ask("init", path, "right", "nobody", "1", "-", "2").ended()
     assert "Whose are these 4 files?" in done.out
     assert "1  left\n  2  right" in done.out
     assert "expected a camera of rig.toml, or -, found nobody" in done.out

@@ -312,9 +312,7 @@ TRACK = (
 )
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    return small_sequence(tmp_path_factory)
+root = small_sequence
 
 
 @pytest.mark.slow
@@ -382,8 +380,7 @@ def test_a_sweep_goes_on(run_psotrack, root, place, tmp_path, monkeypatch):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
     words = ["sweep", grid_file(tmp_path, [2, 3]), "--data", root, "--quiet", "--out", "results"]
     with files_up_to(LEAST):
-        result = run_psotrack(*words)
-    assert result.code == 2
+        result = run_psotrack(*words).ended(2)
     assert "results" in result.err
     # No cell has failed: the disk has.
     assert not list(place.glob("results/cells/*.error.json"))
@@ -437,7 +434,6 @@ def test_a_cache_that_cannot_be_written_is_read(run_psotrack, root, tmp_path, mo
     words = TRACK.format(root=root).split()
     for cache, name in ((read_only, "tracks.csv"), (root / "cache", "again.csv")):
         monkeypatch.setenv("PSOTRACK_CACHE", str(cache))
-        result = run_psotrack(*words, "--out", tmp_path / name)
-        assert result.code == 0
+        result = run_psotrack(*words, "--out", tmp_path / name).ended()
         assert result.err == ""
     assert (tmp_path / "tracks.csv").read_bytes() == (tmp_path / "again.csv").read_bytes()

@@ -30,12 +30,12 @@ class Announcer:
 sys.meta_path.insert(0, Announcer())
 main()
 """
+#: Hears Ctrl-C, and runs the function `run` in the place of the command line.
+LISTEN = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+RUN = "import psotrack.__main__, psotrack.cli; psotrack.cli.main = run; psotrack.__main__.main()"
 #: A command that is in a long computation, which is not Python's, while it writes a file.
-IN_A_LONG_COMPUTATION = """
-import signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)
-import psotrack.__main__
-import psotrack.cli
+IN_A_LONG_COMPUTATION = f"""
+{LISTEN}
 
 def run(started):
     import jax
@@ -49,23 +49,19 @@ def run(started):
         # Minutes of work in one call.
         compute(2 * 10**9).block_until_ready()
 
-psotrack.cli.main = run
-psotrack.__main__.main()
+{RUN}
 """
 #: A command in a library that raises an error of its own when it is interrupted.
-IN_A_LIBRARY = """
-import signal, zipfile
-signal.signal(signal.SIGINT, signal.default_int_handler)
-import psotrack.__main__
-import psotrack.cli
+IN_A_LIBRARY = f"""
+{LISTEN}
+import zipfile
 
 def run(started):
     with zipfile.ZipFile("a.zip", "w") as zipped:
         left_open = zipped.open("half", "w")
         signal.raise_signal(signal.SIGINT)
 
-psotrack.cli.main = run
-psotrack.__main__.main()
+{RUN}
 """
 #: A command that has finished, and gets a signal while Python ends.
 AT_THE_END = """
@@ -80,8 +76,8 @@ sys.modules["last"] = Last()
 psotrack.__main__.main()
 """
 #: A command whose worker processes say something when they end.
-WITH_NOISY_WORKERS = """
-import atexit, os, signal, sys, time
+WITH_NOISY_WORKERS = f"""
+import atexit, os, sys, time
 from psotrack.support import map_in_processes
 
 def work(task, advance):
@@ -94,11 +90,8 @@ def run(started):
     map_in_processes(work, [1, 2], jobs=2, advance=int)
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    import psotrack.__main__
-    import psotrack.cli
-    psotrack.cli.main = run
-    psotrack.__main__.main()
+    {LISTEN}
+    {RUN}
 """
 #: Presses Ctrl-C in a callback of the garbage collector, which drops exceptions.
 UNHEARD = """
@@ -121,12 +114,6 @@ CODES = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated"
 FOREVER_S = 120.0
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """A recording that takes some seconds, which no test changes."""
-    return make_once(tmp_path_factory, "recording_of_signals", lambda folder: make_sequence(folder, repeat=8))
-
-
 def group_of(process):
     """Processes of the session that a process began, except itself."""
     found = subprocess.run(["pgrep", "-g", f"{process.pid}"], capture_output=True, text=True, check=False)
@@ -146,15 +133,13 @@ def assert_ends(process, number):
     assert group_of(process) == []
 
 
-def wait_for_files(process, folder):
-    """Wait until the process has made something in a folder."""
-    while process.poll() is None and not list(folder.glob("**/*")):
-        time.sleep(0.01)
-
-
 @pytest.fixture
-def start_track(start_python, flight, tmp_path):
+def start_track(start_python, tmp_path_factory, tmp_path):
     """Starts `track`, which would replace an earlier result; it has begun to import the command line."""
+    # A recording that takes some seconds, which no test changes.
+    flight = make_once(
+        tmp_path_factory, "recording_of_signals", lambda folder: make_sequence(folder, repeat=8)
+    )
 
     def start(program):
         (tmp_path / "tracks.csv").write_text("earlier")
@@ -181,7 +166,9 @@ def test_a_command_at_work_ends_with_one_line(start_track, tmp_path):
     """Here a shell ignores Ctrl-C, so that only SIGTERM ends the command."""
     process = start_track(AT_A_TERMINAL.replace("signal.default_int_handler", "signal.SIG_IGN"))
     process.send_signal(signal.SIGINT)
-    wait_for_files(process, tmp_path / "cache")
+    # It is at work as soon as something is in the cache.
+    while process.poll() is None and not list(tmp_path.glob("cache/**/*")):
+        time.sleep(0.01)
     assert process.poll() is None
     assert_ends(process, signal.SIGTERM)
     assert_unchanged(tmp_path)

@@ -11,7 +11,7 @@ import pytest
 from clock_worlds import FPS, LATE_S, make_late_videos
 from evaluation_flights import NUM_FRAMES, ROUNDING, with_covariance
 from evaluation_flights import circling_flights as flights
-from helpers import make_once
+from helpers import fading, make_once
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
@@ -24,16 +24,7 @@ ARM_M = np.array([0.03, -0.02, -0.117])
 LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 
 
-def autoregressive(rng, count: int, persistence: float):
-    """(count,), stationary autoregressive series of variance 1."""
-    values = rng.normal(size=count)
-    new = np.sqrt(1 - persistence**2)
-    for i in range(1, count):
-        values[i] = persistence * values[i - 1] + new * values[i]
-    return values
-
-
-def turning_flight(num_frames: int = 400):
+def turning_flight(num_frames=400):
     """Estimate and reference of a drone that flies and turns; the tracked point is at the end of the lever arm."""
     rng = np.random.default_rng(0)
     frame = np.arange(num_frames)
@@ -53,7 +44,7 @@ class TestOffsets:
     def test_the_standard_error_equals_the_spread_of_means(self, persistence):
         """The oracle is the spread of the means of 300 series of 1000 frames."""
         rng = np.random.default_rng(1)
-        series = np.stack([autoregressive(rng, 1000, persistence) for _ in range(300)], axis=1)
+        series = fading(rng.normal(size=(1000, 300)), persistence)
         spread = series.mean(axis=0).std()
         # The spread of 300 means has an error of 4 %; blocks of 50 frames miss 10 % where 19 frames count as one.
         assert np.sqrt((standard_error(series) ** 2).mean()) == pytest.approx(spread, rel=0.15)

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_paths import camera_path
+from camera_paths import AHEAD, camera_path
+from clock_worlds import random_motion
 from evo.core import metrics, sync
 from evo.tools import file_interface
 from helpers import assert_refused
@@ -24,8 +25,6 @@ from psotrack.support import COLOURS, FAINT
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
 FPS = 25.0
-#: Columns: the axes of a camera that looks ahead, in the axes of a body (x ahead, z up).
-LOOKS_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 TURN = Rotation.from_euler("ZYX", [-90.0, 4.0, -97.0], degrees=True)
 NO_TURN = Rotation.identity()
 ARM_M = np.array([0.12, -0.03, 0.05])
@@ -35,23 +34,17 @@ CLOCK_S, TURN_CLOCK_S = 0.3137, -2.173
 
 def flown_m(time_s, speed_m_s=1.0, seed=0):
     """Motion that never repeats, at about this speed: (times, 3), metres."""
-    rng = np.random.default_rng(seed)
-    rate = rng.uniform(0.4, 1.6, (4, 3))
-    phase = rng.uniform(0, 2 * np.pi, (4, 3))
-    angle = rate * np.asarray(time_s)[:, None, None] + phase
-    amplitude_m = speed_m_s / np.sqrt(6) / rate
-    swung_m = (amplitude_m * np.sin(angle)).sum(axis=1)
-    return np.array([0.0, 0.0, 1.5]) + swung_m
+    return random_motion(seed, speed_m_s)(time_s) - [3.0 * seed, 0.0, 0.0]
 
 
-def body_orientations(time_s, seed=1) -> Rotation:
+def body_orientations(time_s, seed=1):
     """Orientations of a body that turns about the vertical and sways a little; yaw passes 180 degrees."""
     sway_deg = 12.0 * flown_m(time_s, seed=seed)
     angles_deg = sway_deg * [15, 1, 1] + [170, -18, 0]
     return Rotation.from_euler("ZYX", angles_deg, degrees=True)
 
 
-def body(time_s, position_m, wxyz=None, name="body") -> Trajectories:
+def body(time_s, position_m, wxyz=None, name="body"):
     """Poses of the reference's body."""
     frame = np.arange(len(time_s))
     poses = Trajectories(frame, time_s, (name,), position_m[:, None])
@@ -68,11 +61,11 @@ def compare(path, time_s, position_m, wxyz=None, *, orientation_time_s=None, **o
     return compare_paths(path, body(time_s, position_m), turns, path_settings)
 
 
-def as_wxyz(rotation: Rotation):
+def as_wxyz(rotation):
     return rotation.as_quat(scalar_first=True)
 
 
-def rotations(wxyz) -> Rotation:
+def rotations(wxyz):
     return Rotation.from_quat(wxyz, scalar_first=True)
 
 
@@ -132,7 +125,7 @@ def test_differences_and_angles_of_random_orientations(seed):
     np.testing.assert_array_equal(found.turn_wxyz, [1, 0, 0, 0])
     assert found.offset_s == comparison.offset_s
     by_body = compare(path, *recording(seconds=8), axes="body", **options).turning
-    to_body = Rotation.from_matrix(LOOKS_AHEAD).inv()
+    to_body = Rotation.from_matrix(AHEAD).inv()
     for each, ahead in ((found, to_body), (by_body, NO_TURN)):
         own_deg = (poses * ahead).as_euler("ZYX", degrees=True)
         reference = rotations(each.reference_wxyz) * ahead

@@ -2,17 +2,16 @@
 
 import runpy
 import sys
-from pathlib import Path
 
 import pytest
-from helpers import Output, Run
+from helpers import Output
 
 
 @pytest.fixture
-def run_program(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
+def run_program(monkeypatch, capfd):
     """Runs a program with some words in this process; the programs append folders to the path of imports."""
 
-    def call(program: Path, *words: object) -> Output:
+    def call(program, *words):
         monkeypatch.setattr(sys, "argv", [*map(str, (program, *words))])
         monkeypatch.setattr(sys, "path", [str(program.parent), *sys.path])
         capfd.readouterr()

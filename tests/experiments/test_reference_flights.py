@@ -16,7 +16,7 @@ PROGRAM = ROOT / "experiments" / "reference_flights.py"
 
 
 @pytest.mark.slow
-def test_the_results_have_not_changed() -> None:
+def test_the_results_have_not_changed():
     """The program has JAX's own settings, as its numbers were made, and its own compiled programs."""
     environment = environment_without_jax_settings()
     environment.pop("XLA_FLAGS", None)
@@ -26,7 +26,7 @@ def test_the_results_have_not_changed() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_change_is_noticed_and_the_remedy_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_is_noticed_and_the_remedy_said(tmp_path, monkeypatch):
     """A number that is 0.3 % off, and numbers of another version."""
     # The program appends folders to the path of imports.
     monkeypatch.setattr(sys, "path", [str(PROGRAM.parent), *sys.path])
@@ -34,7 +34,7 @@ def test_a_change_is_noticed_and_the_remedy_said(tmp_path: Path, monkeypatch: py
     found = {"tracks": 2, "error (mm)": 1.5}
     monkeypatch.setattr(program, "FLIGHTS", {"short": lambda _: found})
 
-    def run(*words: str) -> None:
+    def run(*words):
         monkeypatch.setattr(sys, "argv", [PROGRAM.name, "--numbers", str(numbers), *words])
         program.main()
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import pandas as pd
 import pytest
-from helpers import Run, make_once
+from helpers import made_once
 
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 
@@ -14,22 +14,19 @@ METHODS = ("paper", "single frames", "filter", "smoother")
 FPS, NUM_FRAMES = 25.0, 60
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def make_data(root):
     """A data folder with one sequence of two drones, whose own videos have half the usual size."""
+    corner = {"position_m": (2.9, 2.1, 2.5), "target_m": (0.0, 0.0, 1.0)}
+    recipe = change_scenario(scenario("S01_D2_A"), {"cameras": [corner], "image_size_wh": [160, 160]})
+    simulate(recipe, root, SimulationSettings(NUM_FRAMES, 0.5, masks=False), jobs=1)
 
-    def make(root: Path) -> None:
-        corner = {"position_m": (2.9, 2.1, 2.5), "target_m": (0.0, 0.0, 1.0)}
-        recipe = change_scenario(scenario("S01_D2_A"), {"cameras": [corner], "image_size_wh": [160, 160]})
-        simulate(recipe, root, SimulationSettings(NUM_FRAMES, 0.5, masks=False), jobs=1)
 
-    return make_once(tmp_path_factory, "table7", make)
+data = made_once("table7", make_data)
 
 
 @pytest.mark.nightly
-def test_tables_rows_and_a_second_run(run_program: Run, data: Path, tmp_path: Path) -> None:
-    done = run_program(EXPERIMENT / "table7.py", "--data", data, "--out", tmp_path)
-    assert done.code == 0, done.err
+def test_tables_rows_and_a_second_run(run_program, data, tmp_path):
+    run_program(EXPERIMENT / "table7.py", "--data", data, "--out", tmp_path).ended()
     every = pd.read_csv(tmp_path / "results.csv")
     assert set(every["drone"]) == {"dron1", "dron2", "all"}
     rows = every[every["drone"] == "dron1"].set_index(["wrong", "method"])

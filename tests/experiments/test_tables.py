@@ -7,7 +7,6 @@ import cv2
 import pandas as pd
 import pytest
 import small_sweeps
-from helpers import Run
 
 from psotrack.show.flights import colour_rgb
 from psotrack.support import COLOURS
@@ -32,24 +31,21 @@ detections = "blobs"
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_sweeps.small_sequence(tmp_path_factory)
+data = small_sweeps.small_sequence
 
 
 @pytest.fixture
-def run(run_program: Run, data: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+def run(run_program, data, monkeypatch):
     """Runs a program of the experiments."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(data / "cache"))
     return lambda script, *words: run_program(EXPERIMENTS / script, *words)
 
 
-def test_table_4(run: Run, data: Path, tmp_path: Path) -> None:
+def test_table_4(run, data, tmp_path):
     methods, out = tmp_path / "methods.toml", tmp_path / "table4"
     methods.write_text(METHODS)
     words = ("--methods", methods, "--data", data, "--out", out, "--results", tmp_path)
-    done = run("table4/table4.py", *words)
-    assert done.code == 0, done.err
+    run("table4/table4.py", *words).ended()
     rows = pd.read_csv(tmp_path / "table4.csv").set_index("method")
     assert list(rows["sequence"]) == ["S01_D2_A"] * 2
     # Both methods begin at the true positions; the images have a quarter of the pixels.
@@ -65,12 +61,11 @@ def test_table_4(run: Run, data: Path, tmp_path: Path) -> None:
     assert (nothing.code, nothing.err) == (1, f"table4: {tmp_path / 'none'}: {expected}\n")
 
 
-def test_table_5_is_made_once(run: Run, data: Path, tmp_path: Path) -> None:
+def test_table_5_is_made_once(run, data, tmp_path):
     grid, out = tmp_path / "grid.toml", tmp_path / "table5"
     grid.write_text(GRID)
     words = ("--grid", grid, "--data", data, "--out", out, "--results", tmp_path)
-    done = run("table5/table5.py", *words)
-    assert done.code == 0, done.err
+    done = run("table5/table5.py", *words).ended()
     assert "S01_D2_A: 86 to 140 mm" in done.out
     rows = pd.read_csv(tmp_path / "table5.csv")
     assert (len(rows), set(rows["method"])) == (8, {"paper", "psotrack"})
@@ -85,10 +80,9 @@ def test_table_5_is_made_once(run: Run, data: Path, tmp_path: Path) -> None:
     assert small_sweeps.stamps(out) == before
 
 
-def test_from_videos_to_tracks(run: Run, data: Path, tmp_path: Path) -> None:
+def test_from_videos_to_tracks(run, data, tmp_path):
     words = ("--sequence", data / "Simulated_Data" / "S01_D2_A", "--repeats", 1, "--results", tmp_path)
-    done = run("benchmark.py", "videos", *words, "--backgrounds", "living")
-    assert done.code == 0, done.err
+    run("benchmark.py", "videos", *words, "--backgrounds", "living").ended()
     (row,) = pd.read_csv(tmp_path / "speed.csv").to_dict("records")
     # Six frames at a small size do not show both drones.
     assert (row["drones"] >= 1, row["background"], row["video_s"]) == (True, "living", 0.24)

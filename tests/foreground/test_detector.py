@@ -5,11 +5,11 @@ import json
 
 import numpy as np
 import pytest
-from helpers import assert_refused, make_unnamed_rig
+from helpers import assert_refused, make_unnamed_rig, posed, simple_lens
 from onnx_models import SIDE, STRIDE, bright_squares
 
 from psotrack.foreground.detection import DetectorSettings, OnnxDetector, detect_drones
-from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry import project
 from psotrack.geometry.rig_files import write_calibration
 from psotrack.recordings import VideoWriter, probe, read_detections
 from psotrack.recordings.datasets import CALIBRATION
@@ -44,7 +44,7 @@ def models(tmp_path_factory):
     return folder
 
 
-def square(size: int, column: int, row: int):
+def square(size, column, row):
     """xyxy of one of the network's squares in the image; the grey border above the image is an eighth of the input."""
     x0 = SCALE * STRIDE * column
     y0 = SCALE * (STRIDE * row - size // 8)
@@ -163,12 +163,8 @@ def flight_folder(tmp_path_factory):
     """Folder with the videos of four cameras, which see a flying drone as a white square, the last not in frame 1."""
     folder = tmp_path_factory.mktemp("tracked") / "Simulated_Data" / "S02_D1"
     folder.mkdir(parents=True)
-    cameras = []
-    for x_m, y_m in ((0.0, -6.0), (6.0, 0.5), (-0.5, 6.0), (-6.0, -0.5)):
-        R, t_m = look_at((x_m, y_m, 2.0), (0.0, 0.0, 1.5))
-        K = np.array([[1100.0, 0.0, 127.5], [0.0, 1100.0, 95.5], [0.0, 0.0, 1.0]])
-        cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(256, 192)))
-    rig = make_unnamed_rig(*cameras)
+    lens, places_m = simple_lens(1100.0, (256, 192)), ((0.0, -6.0), (6.0, 0.5), (-0.5, 6.0), (-6.0, -0.5))
+    rig = make_unnamed_rig(*(posed(lens, (*place_m, 2.0), (0.0, 0.0, 1.5)) for place_m in places_m))
     write_calibration(folder / CALIBRATION, rig)
     for index, name in enumerate(rig.names):
         with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:

@@ -2,7 +2,7 @@
 
 import functools
 import json
-from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import jax.numpy as jnp
@@ -52,11 +52,8 @@ def pictures(count=10):
     generator = np.random.default_rng(0)
     small = generator.integers(60, 200, (8, 8, 3), np.uint8)
     background = cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
-    images, covered, boxes = (
-        np.repeat(background[None], count, 0),
-        np.zeros((count, SIDE, SIDE), np.uint8),
-        [],
-    )
+    images, boxes = np.repeat(background[None], count, 0), []
+    covered = np.zeros((count, SIDE, SIDE), np.uint8)
     for image, mask in zip(images, covered, strict=True):
         places = [(int(generator.integers(10, 54)), y) for y in (16, 46)]
         boxes.append([cross(mask, *place, 255) for place in places])
@@ -165,19 +162,12 @@ QUICK = TrainSettings(epochs=2, steps=2, batch=2, part_px=32)
 
 
 def test_an_interrupted_training_goes_on_to_the_same_bytes(tmp_path):
-    def interrupt(line):
-        raise KeyboardInterrupt
-
     about = {"pictures": 10}
     train([pictures()], [pictures()], tmp_path / "whole.model", QUICK, about=about)
-    said = []
+    # Epoch 2 is cut off, and done again.
+    say = Mock(side_effect=[None, KeyboardInterrupt])
     with pytest.raises(KeyboardInterrupt):
-        # Epoch 2 is cut off, and done again.
-        train(
-            *([pictures()], [pictures()], tmp_path / "part.model", QUICK),
-            about=about,
-            say=lambda line: said.append(line) if not said else interrupt(line),
-        )
+        train([pictures()], [pictures()], tmp_path / "part.model", QUICK, about=about, say=say)
     assert (tmp_path / "part.unfinished").exists()
     assert not (tmp_path / "part.model").exists()
     other = TrainSettings(epochs=2, steps=3, batch=2, part_px=32)
@@ -396,7 +386,7 @@ def test_its_onnx_file_finds_the_same(tmp_path):
 
 
 def test_the_sides_of_a_frame_need_not_be_multiples_of_eight(tmp_path):
-    path = Path(tmp_path) / "drones.model"
+    path = tmp_path / "drones.model"
     model = train([pictures()], [pictures()], path, QUICK, about={})
     share, boxes, _ = findings(model.network, np.zeros((37, 53, 3), np.uint8), None, 0.0)
     assert share.shape == (37, 53)

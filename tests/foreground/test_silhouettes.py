@@ -1,7 +1,5 @@
 """Silhouettes: their settings, the store and the cache, frames that are left out, and blobs."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json
@@ -11,14 +9,13 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
-from helpers import assert_refused, cameras_of, far_camera, make_once, with_cameras
+from helpers import assert_refused, cameras_of, far_camera, made_once, with_cameras
 from hypothesis import given
 from hypothesis import strategies as st
 from worker_tasks import double, fail_and_be_ended
@@ -29,7 +26,6 @@ from psotrack.foreground.silhouettes import (
     ForegroundSettings,
     Living,
     Mog2,
-    Silhouettes,
     SilhouetteSettings,
     blob_detections,
     border_cells,
@@ -52,7 +48,7 @@ from psotrack.recordings import (
     probe_silhouettes,
     read_frames,
 )
-from psotrack.support import Advance, atomic_write, map_in_processes
+from psotrack.support import atomic_write, map_in_processes
 
 NUM_FRAMES = 30
 SIZE_WH = (162, 118)  # not multiples of 4
@@ -63,9 +59,7 @@ SETTINGS = SilhouetteSettings(
 NUM_USABLE, SHAKEN = 80, range(40, 55)
 
 
-def _write_video(
-    path: Path, seed: int, num_frames: int = NUM_FRAMES, *, shaken=(), frozen=(), black=(), turns_at=None
-) -> None:
+def _write_video(path, seed, num_frames=NUM_FRAMES, *, shaken=(), frozen=(), black=(), turns_at=None):
     """A video of a dark disc that moves in front of a smooth texture, with noise."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(90, 190, (5, 7, 3)).astype(np.float32)
@@ -86,7 +80,7 @@ def _write_video(
             writer.write(picture)
 
 
-def _make_recording(folder: Path) -> Recording:
+def _make_recording(folder):
     """A recording of all videos in a folder."""
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
     camera = far_camera(image_size_wh=SIZE_WH, pixels_per_m=20)
@@ -94,14 +88,12 @@ def _make_recording(folder: Path) -> Recording:
     return Recording(folder.name, folder, cameras_of(rig, video=videos))
 
 
-def _make_videos(folder: Path) -> None:
+def _make_videos(folder):
     for seed in range(3):
         _write_video(folder / f"cam{seed + 1}.avi", seed)
 
 
-@pytest.fixture(scope="session")
-def video_folder(tmp_path_factory):
-    return make_once(tmp_path_factory, "three_videos", _make_videos)
+video_folder = made_once("three_videos", _make_videos)
 
 
 @pytest.fixture
@@ -126,7 +118,7 @@ def make(tmp_path, decoded):
     """Computes the silhouettes of a recording in this process, into the cache of the test."""
 
     @contextlib.contextmanager
-    def report(description: str, total: int) -> Iterator[Advance]:
+    def report(description, total):
         before = sum(decoded)
         yield decoded.append
         assert (description, total) == ("silhouettes", sum(decoded) - before)
@@ -134,7 +126,7 @@ def make(tmp_path, decoded):
     return functools.partial(compute, settings=SETTINGS, cache=tmp_path / "cache", jobs=1, report=report)
 
 
-def _expected(recording: Recording) -> np.ndarray:
+def _expected(recording):
     """Silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
     scaled = SETTINGS.scaled([SIZE_WH])
     step = learning_step(recording.num_frames, scaled)
@@ -146,21 +138,21 @@ def _expected(recording: Recording) -> np.ndarray:
     return np.stack(cameras, axis=1)
 
 
-def _read_all(silhouettes: Silhouettes) -> np.ndarray:
+def _read_all(silhouettes):
     return silhouettes.read(0, silhouettes.num_frames)
 
 
-def _keys(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> dict[str, str]:
+def _keys(recording, settings=SETTINGS):
     return {name: each.key for name, each in stored_silhouettes(recording, settings, Path()).items()}
 
 
-def _damage(path: Path) -> None:
+def _damage(path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 0xFF
     path.write_bytes(content)
 
 
-def _warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+def _warnings(caplog):
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
@@ -373,17 +365,17 @@ def test_what_is_ignored_is_background_and_belongs_to_the_key(recording, tmp_pat
     np.testing.assert_array_equal(after[:, 1:], before[:, 1:])
 
 
-def _with_small_mask(recording: Recording) -> Recording:
+def _with_small_mask(recording):
     path = recording.folder / "small.png"
     cv2.imwrite(str(path), np.zeros((10, 10), np.uint8))
     return with_cameras(recording, ignore={"cam1": path})
 
 
-def _without_video(recording: Recording) -> Recording:
+def _without_video(recording):
     return with_cameras(recording, video={"cam2": None})
 
 
-def _without_file(recording: Recording) -> Recording:
+def _without_file(recording):
     recording.videos["cam2"].path.unlink()
     return recording
 
@@ -412,7 +404,7 @@ def test_settings_of_another_background_are_refused():
 
 
 def test_results_come_in_the_order_of_tasks_and_a_process_that_dies_is_said():
-    done: list[int] = []
+    done = []
     assert map_in_processes(double, [5, 3, 4, 1], jobs=2, advance=done.append) == [10, 6, 8, 2]
     assert sorted(done) == [1, 3, 4, 5]
     died = "a worker process: expected a result, found that the process died"

@@ -6,25 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pixel_sums import area_weighted_sum
 
 from psotrack.foreground.silhouettes import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
-
-
-def shares_in(low, high, num_pixels):
-    """The share of each pixel of a line that lies between two places."""
-    pixel = np.arange(num_pixels)
-    end = np.minimum(high, pixel + 1)
-    start = np.maximum(low, pixel)
-    return np.clip(end - start, 0, 1)
-
-
-def area_weighted_sum(image, box):
-    """Sum over all pixels of the pixel's share in the box times its value, in float64."""
-    x0, y0, x1, y1 = box.astype(np.float64)
-    height, width = image.shape
-    rows = shares_in(y0, y1, height)
-    columns = shares_in(x0, x1, width)
-    return rows @ image.astype(np.float64) @ columns
 
 
 @jax.jit

@@ -3,12 +3,11 @@
 import os
 import signal
 import threading
-from pathlib import Path
 
-from psotrack.support import Advance, atomic_write
+from psotrack.support import atomic_write
 
 
-def double(task: int, advance: Advance) -> int:
+def double(task, advance):
     """Twice a number; a negative one ends the process."""
     if task < 0:
         os._exit(3)
@@ -16,11 +15,11 @@ def double(task: int, advance: Advance) -> int:
     return 2 * task
 
 
-def fail_and_be_ended(path: Path, advance: Advance) -> None:
+def fail_and_be_ended(path, advance):
     """Fail with a folder of many files half written; SIGTERM comes while the folder is being removed."""
     num_files = 2000
 
-    def end_soon() -> None:
+    def end_soon():
         while len(os.listdir(temporary)) == num_files:
             pass
         os.kill(os.getpid(), signal.SIGTERM)

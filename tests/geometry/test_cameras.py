@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from board_rigs import record_detections
-from helpers import assert_refused, float32, make_unnamed_rig, sphere_points
+from helpers import assert_refused, float32, opencv_pixels, posed, simple_lens, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -54,15 +54,6 @@ def make_lens(name):
     return make_camera(
         R=np.eye(3), t_m=np.zeros(3), K=lens_K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye
     )
-
-
-def opencv_pixels(camera, points):
-    function = cv2.projectPoints if camera.fisheye is None else cv2.fisheye.projectPoints
-    T = camera.T_cam_world
-    turn, _ = cv2.Rodrigues(T[:3, :3])
-    flat = np.ascontiguousarray(points.reshape(-1, 1, 3))
-    pixels, _ = function(flat, turn, T[:3, 3], camera.K, camera.dist)
-    return pixels.reshape(*points.shape[:-1], 2)
 
 
 def rays(angles_deg, directions=16):
@@ -175,9 +166,7 @@ def mixed_rig():
     centres_m = [(4.0, 0.5, 2.0), (-3.5, 1.0, 2.4), (0.0, -5.0, 1.5)]
     cameras = {}
     for name, centre_m in zip(MIXED, centres_m, strict=True):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = look_at(centre_m, (0.0, 0.0, 1.0))
-        cameras[name] = replace(make_lens(name), T_cam_world=T)
+        cameras[name] = posed(make_lens(name), centre_m, (0.0, 0.0, 1.0))
     return make_rig(cameras)
 
 
@@ -299,16 +288,11 @@ def test_undistorting_stretches_small_circles(name):
 FRAMES = 40
 
 
-def looking(centre_m, target_m, focal_px=1000.0, dist=()):
-    R, t_m = look_at([float(x) for x in centre_m], [float(x) for x in target_m])
-    K = np.array([[focal_px, 0, 960], [0, focal_px, 540], [0, 0, 1]])
-    return make_camera(R=R, t_m=t_m, K=K, dist=dist, image_size_wh=(1920, 1080))
-
-
-def rig_of(centres_m, targets_m, **lens):
+def rig_of(centres_m, targets_m, focal_px=1000.0, dist=()):
     """Cameras at places that look at targets."""
-    cameras = [looking(*look, **lens) for look in zip(centres_m, targets_m, strict=True)]
-    return make_unnamed_rig(*cameras)
+    lens = simple_lens(focal_px, (1920, 1080), dist)
+    looks = enumerate(zip(centres_m, targets_m, strict=True))
+    return make_rig({f"{number}": posed(lens, *look) for number, look in looks})
 
 
 def around(target_m):

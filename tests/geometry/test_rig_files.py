@@ -20,7 +20,6 @@ from psotrack.recordings import CameraTable
 
 #: Files of other programs, which have the cameras of `poses`, and those that each program reads with it.
 SOUND = Path(__file__).parents[1] / "data" / "formats"
-CENTRES_M = ((4.0, 0.5, 2.0), (-3.5, 1.0, 2.4))
 K = np.array([[900.0, 0.0, 650.5], [0.0, 905.0, 350.25], [0.0, 0.0, 1.0]])
 SIZE_WH = (1280, 720)
 RADTAN = (-0.12, 0.03, 0.0008, -0.0005)
@@ -40,7 +39,7 @@ SIZE = {"image_size_wh": SIZE_WH}
 
 def poses():
     """Rotation and translation of each camera, world to camera, metres."""
-    return [look_at(centre, (0.0, 0.0, 1.0)) for centre in CENTRES_M]
+    return [look_at(centre, (0.0, 0.0, 1.0)) for centre in ((4.0, 0.5, 2.0), (-3.5, 1.0, 2.4))]
 
 
 SKEWED = K.copy()
@@ -139,7 +138,6 @@ def test_the_cameras_of_a_recording_are_a_rig(tmp_path):
 
 # Files of other programs.
 
-EQUIDISTANT = ("radtan", "equidistant")
 #: File to read, a change of it, arguments of the reader, names of the cameras.
 FORMATS = [
     ("rigs/calibration.toml", (), UNIT, ("c0", "c1")),
@@ -152,7 +150,7 @@ FORMATS = [
     ("easymocap/intri.yml", (), {}, ("1", "07")),
     ("easymocap-matrices/extri.yml", (), SIZE, ("1", "07")),
     ("kalibr/camchain.yaml", (), {}, ("cam0", "cam1")),
-    ("kalibr/camchain.yaml", (EQUIDISTANT,), {}, ("cam0", "cam1")),
+    ("kalibr/camchain.yaml", (("radtan", "equidistant"),), {}, ("cam0", "cam1")),
     ("handpose/rot_trans_c1.dat", (), SIZE | UNIT, ("cam0", "cam1")),
 ]
 

@@ -2,32 +2,31 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, make_unnamed_rig, move_world, points_in_room, project_points, ring_rig
+from helpers import (
+    LENSES,
+    make_unnamed_rig,
+    move_world,
+    opencv_pixels,
+    points_in_room,
+    posed,
+    project_points,
+    ring_rig,
+    simple_lens,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.geometry import look_at, make_camera, project, reconstruct, triangulate, triangulate_linearly
+from psotrack.geometry import project, reconstruct, triangulate, triangulate_linearly
 
 
 def noisy_pixels(rig, points, seed=0, noise_px=1.0):
     pixels = project_points(rig, points)
     return pixels + np.random.default_rng(seed).normal(size=pixels.shape) * np.asarray(noise_px)[..., None]
-
-
-def opencv_pixels(rig, index, points):
-    """(points, 2) and their derivative by the world point (points, 2, 3), by cv2.projectPoints."""
-    one = rig.cameras[index]
-    R = one.T_cam_world[:3, :3]
-    turn, _ = cv2.Rodrigues(R)
-    pixels, by = cv2.projectPoints(points.reshape(-1, 3), turn, one.T_cam_world[:3, 3], one.K, one.dist)
-    # The derivative by the translation is the derivative by the point in camera coordinates.
-    return pixels[:, 0], by[:, 3:6].reshape(-1, 2, 3) @ R
 
 
 # --- linear points
@@ -101,7 +100,7 @@ def test_refined_points_agree_with_scipy(coefficients):
 
         def off_px(point, n=n):
             """(cameras, 2), NaN for a view that sees nothing."""
-            seen = [opencv_pixels(rig, camera, point)[0][0] for camera in range(5)]
+            seen = [opencv_pixels(rig.cameras[camera], point) for camera in range(5)]
             return np.array(seen) - pixels[n]
 
         def off(point, n=n, off_px=off_px):
@@ -292,10 +291,7 @@ def assert_no_point(found):
     assert not found.used.any()
 
 
-def narrow_camera(centre_m, target_m):
-    R, t_m = look_at(centre_m, target_m)
-    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(320, 240))
+NARROW = simple_lens(300.0, (320, 240))
 
 
 def test_views_that_determine_no_point_give_nan():
@@ -311,8 +307,8 @@ def test_views_that_determine_no_point_give_nan():
     one = rig.cameras[0]
     at_one_place = make_unnamed_rig(one, one, one)
     assert_no_point(reconstruct(at_one_place.cameras, project_points(at_one_place, points)))
-    left = narrow_camera((-1, 0, 1), (-1.5, 3, 1))
-    right = narrow_camera((1, 0, 1), (1.5, 3, 1))
+    left = posed(NARROW, (-1, 0, 1), (-1.5, 3, 1))
+    right = posed(NARROW, (1, 0, 1), (1.5, 3, 1))
     apart = make_unnamed_rig(left, right)
     # The rays meet behind the cameras.
     assert_no_point(reconstruct(apart.cameras, np.full((2, 2, 2), 130.0)))
@@ -321,7 +317,7 @@ def test_views_that_determine_no_point_give_nan():
 def test_a_camera_that_looks_away_is_left_out():
     """The point is behind the last camera; the pixel of this camera belongs to another object."""
     point = np.array([0.2, 0.1, 1.2])
-    away = narrow_camera((0, 3, 1.2), (0, 6, 1.2))
+    away = posed(NARROW, (0, 3, 1.2), (0, 6, 1.2))
     rig = make_unnamed_rig(*ring_rig(4).cameras, away)
     pixels = project_points(rig, point)
     pixels[4] = [160.0, 120.0]

@@ -15,13 +15,14 @@ from camera_paths import (
     remove_poses,
     squared_errors,
 )
+from helpers import fading
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.inside_out import CameraPath, Flag, PoseFilterParams, smooth
+from psotrack.inside_out import Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import choose_agility, filter_path, poses_of
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.pose import CameraPose
@@ -32,7 +33,7 @@ STD_M, STD_RAD = 0.004, 0.0008
 NINETY = chi2.ppf(0.9, 3)
 
 
-def pose_covariance() -> np.ndarray:
+def pose_covariance():
     """Covariance of a pose: shifts to the side and turns about the vertical axis are correlated, as in real poses."""
     covariance = np.diag([STD_M**2] * 3 + [STD_RAD**2] * 3)
     covariance[0, 4] = covariance[4, 0] = 0.8 * STD_M * STD_RAD
@@ -40,7 +41,7 @@ def pose_covariance() -> np.ndarray:
     return covariance
 
 
-def raw_path(position_m, orientation) -> CameraPath:
+def raw_path(position_m, orientation):
     covariance = np.tile(pose_covariance(), (len(position_m), 1, 1))
     return camera_path(position_m, orientation, covariance, num_markers=2)
 
@@ -76,18 +77,14 @@ def flight(frames, *, acceleration=2.0, shake=2.0, seed=0):
     rng = np.random.default_rng(seed)
     position_m, truth = random_motion(rng, frames, acceleration, shake)
     root = np.linalg.cholesky(pose_covariance())
-    kept = np.exp(-1 / FPS / 0.5)
-    lasting = rng.normal(size=6)
-    error = np.zeros((frames, 6))
-    for k in range(frames):
-        white = rng.normal(size=6)
-        error[k] = root @ (np.sqrt(0.6) * lasting + np.sqrt(0.4) * white)
-        lasting = kept * lasting + np.sqrt(1 - kept**2) * rng.normal(size=6)
+    noise = rng.normal(size=(frames, 2, 6))
+    lasting = fading(noise[:, 0], np.exp(-1 / FPS / 0.5))
+    error = (np.sqrt(0.6) * lasting + np.sqrt(0.4) * noise[:, 1]) @ root.T
     raw_turns = truth * Rotation.from_rotvec(-error[:, 3:])
     return raw_path(position_m - error[:, :3], raw_turns), position_m, truth
 
 
-def move_poses(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraPath:
+def move_poses(path, rows, shift_m, turn=(0.0, 0.0, 0.0)):
     """The path with some poses shifted and turned."""
     position_m = path.position_m.copy()
     position_m[rows] += shift_m
@@ -97,7 +94,7 @@ def move_poses(path: CameraPath, rows, shift_m, turn=(0.0, 0.0, 0.0)) -> CameraP
     return replace(path, position_m=position_m, orientation_wxyz=orientation_wxyz)
 
 
-def typical(error, percent=50) -> float:
+def typical(error, percent=50):
     """The median length of errors (n, 3), or another percentile."""
     lengths = np.linalg.norm(error, axis=1)
     return float(np.percentile(lengths, percent))
@@ -109,7 +106,7 @@ turns = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 AGILITY = pose_motion.Agility(4.0, 0.7)
 
 
-def test_transition_matrix_is_the_derivative_of_the_motion() -> None:
+def test_transition_matrix_is_the_derivative_of_the_motion():
     """F equals the numerical derivative of the motion, turns included."""
     rng = np.random.default_rng(2)
     pose = CameraPose(rng.normal(size=3), Rotation.random(rng=rng).as_matrix(), pose_covariance())
@@ -126,7 +123,7 @@ def test_transition_matrix_is_the_derivative_of_the_motion() -> None:
         np.testing.assert_allclose(F[:, k], slope, atol=1e-8)
 
 
-def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_frames() -> None:
+def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_frames():
     """The reference solves one linear problem for the positions, velocities, accelerations and errors of all frames.
 
     F and Q come from the matrix exponential (C. F. Van Loan, Computing integrals involving the matrix exponential,
@@ -160,7 +157,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
     first = start.covariance[np.ix_(part, part)]
     rows, wanted = [], []
 
-    def equation(coefficients, right, cov) -> None:
+    def equation(coefficients, right, cov):
         whiten = np.linalg.inv(np.linalg.cholesky(cov))
         rows.append(whiten @ coefficients)
         wanted.append(whiten @ right)
@@ -195,7 +192,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
 
 
 @pytest.mark.parametrize("size", [0.5, 25.0], ids=["hovering", "racing"])
-def test_a_camera_is_followed_as_well_as_stated(size) -> None:
+def test_a_camera_is_followed_as_well_as_stated(size):
     """The filter knows neither the camera's motion nor the duration of lasting errors; the smoother is better.
 
     Found: nine levels of motion lost a flight at 25 m/s2, with errors of metres, or had 8.9 mm where raw poses had 6.6.
@@ -227,7 +224,7 @@ def test_a_camera_is_followed_as_well_as_stated(size) -> None:
     assert speeds[1] < speeds[0] < 0.1 + size / FPS
 
 
-def test_outliers_are_bridged_with_growing_uncertainty() -> None:
+def test_outliers_are_bridged_with_growing_uncertainty():
     """Single wrong poses, a run of them, and some at both ends."""
     raw, position_m, truth = flight(60, seed=33)
     bad, run = np.r_[0, 15, 40:46, 58:60], slice(40, 46)
@@ -251,7 +248,7 @@ def test_outliers_are_bridged_with_growing_uncertainty() -> None:
     assert (np.diff(variance_m2[39:46]) > 0).all()
 
 
-def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses() -> None:
+def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses():
     raw, position_m, _ = flight(45, seed=12)
     raw = move_poses(raw, slice(25, 45), [0.0, 0.0, 5.0])
     position_m[25:] += [0.0, 0.0, 5.0]
@@ -265,7 +262,7 @@ def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses() -> N
 
 
 @pytest.mark.parametrize("calm", [40, pytest.param(280, marks=pytest.mark.slow)])
-def test_a_late_turn_of_a_hovering_camera_is_followed(calm) -> None:
+def test_a_late_turn_of_a_hovering_camera_is_followed(calm):
     """The agility of 280 calm frames says nothing about the last 20, in which the camera flies off with 40 m/s2."""
     count = calm + 20
     time_s = np.arange(count) / FPS
@@ -284,7 +281,7 @@ def test_a_late_turn_of_a_hovering_camera_is_followed(calm) -> None:
         assert np.nanmax(off_m[calm + 2 :]) < 0.02
 
 
-def test_gaps_are_bridged_for_the_longest_gap() -> None:
+def test_gaps_are_bridged_for_the_longest_gap():
     """By the filter from one side, and by the smoother from both."""
     raw, position_m, truth = flight(110, acceleration=0.5, shake=0.3, seed=14)
     raw = remove_poses(raw, np.r_[0:4, 30:50, 70:100])
@@ -319,7 +316,7 @@ def test_gaps_are_bridged_for_the_longest_gap() -> None:
     # Agreeing markers do not outweigh the motion of a hovering camera.
     [(2.0, 20, 2), (0.05, 60, 8)],
 )
-def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration, before, markers) -> None:
+def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration, before, markers):
     """Five poses after a gap of a second agree with each other but are 2.3 m off."""
     begun = before + 25
     wrong = slice(begun, begun + 5)
@@ -336,7 +333,7 @@ def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration, befor
         assert np.nanmax(off_m[begun:]) < 0.05
 
 
-def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> None:
+def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once():
     raw, position_m, _ = flight(75, acceleration=2.0, shake=2.0, seed=41)
     raw = remove_poses(raw, slice(30, 60))
     # With two markers more poses are needed, because the gap is too long for the motion to predict a pose.
@@ -355,7 +352,7 @@ def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> 
     [(3, 0.0, 0), (3, 0.01, 2), (2, 0.0, 2)],
     ids=["sure", "ambiguous", "by chance"],
 )
-def test_an_unambiguous_first_pose_is_returned_at_once(markers, ambiguity, first) -> None:
+def test_an_unambiguous_first_pose_is_returned_at_once(markers, ambiguity, first):
     raw, _, _ = flight(6, seed=42)
     raw.num_markers[:] = markers
     raw.ambiguity[:] = ambiguity
@@ -365,7 +362,7 @@ def test_an_unambiguous_first_pose_is_returned_at_once(markers, ambiguity, first
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])
-def test_paths_of_few_poses(frames) -> None:
+def test_paths_of_few_poses(frames):
     """A first pose counts if the recording is too short to confirm it; in its own frame, a causal filter cannot."""
     raw, _, _ = flight(5, seed=15)
     values = {name: value[:frames] for name, value in vars(raw).items() if value is not None}
@@ -408,7 +405,7 @@ def with_constant_errors(raw, rng):
 
 
 @pytest.mark.parametrize("draws", [8, pytest.param(40, marks=pytest.mark.nightly)])
-def test_constant_errors_are_not_averaged_away(draws) -> None:
+def test_constant_errors_are_not_averaged_away(draws):
     rng, frames, inside, gated = np.random.default_rng(44), 12, [], 0
     for seed in range(draws):
         raw, position_m, truth = flight(frames, acceleration=0.5, shake=0.5, seed=seed)
@@ -433,7 +430,7 @@ def test_constant_errors_are_not_averaged_away(draws) -> None:
 # Ambiguous poses.
 
 
-def test_an_unambiguous_pose_makes_the_later_path_unambiguous() -> None:
+def test_an_unambiguous_pose_makes_the_later_path_unambiguous():
     raw, _, _ = flight(20, seed=22)
     raw.ambiguity[:], raw.flags[:] = 0.3, Flag.AMBIGUOUS
     raw.ambiguity[10], raw.flags[10] = 0.0, 0
@@ -449,7 +446,7 @@ def test_an_unambiguous_pose_makes_the_later_path_unambiguous() -> None:
 
 @settings(max_examples=4)
 @given(turns, st.lists(st.floats(-100, 100), min_size=3, max_size=3).map(np.array), st.booleans())
-def test_turning_and_shifting_the_world_turns_and_shifts_the_path(rotvec, shift_m, negate) -> None:
+def test_turning_and_shifting_the_world_turns_and_shifts_the_path(rotvec, shift_m, negate):
     raw, _, _ = flight(15, seed=23)
     raw = move_poses(remove_poses(raw, slice(5, 7)), slice(10, 11), [1.0, 0.0, 0.0])
     factor = 1 + 0.5 * np.sin(np.arange(15.0))

@@ -19,7 +19,7 @@ from camera_paths import (
     smooth_flight,
     squared_errors,
 )
-from helpers import make_once
+from helpers import made_once
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -60,7 +60,7 @@ def fused_m(fused, drone=0):
     ],
     ids=str,
 )
-def test_ellipsoids_hold_the_truth_also_with_correlated_errors_and_wrong_covariances(given) -> None:
+def test_ellipsoids_hold_the_truth_also_with_correlated_errors_and_wrong_covariances(given):
     inside, better, scales = [], [], []
     for seed in range(4):
         path, outside, truth_m, rotation = one_flight(seed, **given)
@@ -80,7 +80,7 @@ def test_ellipsoids_hold_the_truth_also_with_correlated_errors_and_wrong_covaria
         assert max(scales) < 0.9
 
 
-def test_a_path_that_was_smoothed_before_is_not_smoothed_again() -> None:
+def test_a_path_that_was_smoothed_before_is_not_smoothed_again():
     path, outside, truth_m, _ = one_flight(24)
     velocity_m_s = np.gradient(truth_m, 1 / FPS, axis=0)
     before = replace(path, position_m=truth_m, velocity_m_s=velocity_m_s)
@@ -89,7 +89,7 @@ def test_a_path_that_was_smoothed_before_is_not_smoothed_again() -> None:
     assert rms(fused_m(fuse(before, vague)) - truth_m) < 1.5e-3
 
 
-def test_a_drone_at_rest() -> None:
+def test_a_drone_at_rest():
     path, outside, truth_m, _ = one_flight(23, 60)
     at_m = np.tile(truth_m[0], (60, 1))
     middle_m = at_m + ARM_M
@@ -100,7 +100,7 @@ def test_a_drone_at_rest() -> None:
     np.testing.assert_allclose(fused.drones[0].weighted.arm_m, ARM_M, atol=1e-9)
 
 
-def test_fusion_of_the_middle() -> None:
+def test_fusion_of_the_middle():
     path, outside, truth_m, rotation = one_flight(5)
     fused = fuse(path, outside, point="middle")
     middle_m = truth_m + rotation.apply(ARM_M)
@@ -110,14 +110,14 @@ def test_fusion_of_the_middle() -> None:
     np.testing.assert_allclose((found.inv() * rotation).magnitude(), 0, atol=1e-7)
 
 
-def test_a_single_path_without_a_name_and_tracks_without_covariances() -> None:
+def test_a_single_path_without_a_name_and_tracks_without_covariances():
     path, outside, truth_m, _ = one_flight(6)
     fused = fuse(path, replace(outside, covariance_m2=None, status=None))
     assert fused.trajectories.drones == ("drone",)
     assert rms(fused_m(fused) - truth_m) < rms(path.position_m - truth_m)
 
 
-def test_the_clock_offset_of_a_camera_is_estimated() -> None:
+def test_the_clock_offset_of_a_camera_is_estimated():
     path, outside, truth_m, _ = one_flight(7)
     late = replace(path, time_s=path.time_s + 0.815)
     fused = fuse(late, outside, max_offset_s=2.0)
@@ -130,7 +130,7 @@ def test_the_clock_offset_of_a_camera_is_estimated() -> None:
     assert rms(error_m) < rms(path.position_m - truth_m)
 
 
-def test_samples_between_frames_are_used_at_their_own_times() -> None:
+def test_samples_between_frames_are_used_at_their_own_times():
     """The camera has the same rate, half a step later; the drone flies at up to 4 m/s: no interpolation, and no lag."""
     _, outside, truth_m, _ = one_flight(8)
     between_m, rotation = smooth_flight(np.random.default_rng(8), 150, offset_s=0.02)
@@ -146,7 +146,7 @@ def test_samples_between_frames_are_used_at_their_own_times() -> None:
 # Faulty input
 
 
-def test_gaps_of_either_source_are_bridged_without_a_jump() -> None:
+def test_gaps_of_either_source_are_bridged_without_a_jump():
     path, outside, truth_m, _ = one_flight(9)
     inside_gap, outside_gap = slice(40, 70), slice(90, 120)
     fused = fuse(remove_poses(path, inside_gap), remove_positions(outside, outside_gap))
@@ -165,7 +165,7 @@ def test_gaps_of_either_source_are_bridged_without_a_jump() -> None:
     assert np.isnan(found.orientation_wxyz[45:65, 0]).all()
 
 
-def test_a_drone_without_both_sources_coasts_and_is_then_lost() -> None:
+def test_a_drone_without_both_sources_coasts_and_is_then_lost():
     path, outside, _, _ = one_flight(9)
     gone = slice(50, 100)
     fused = fuse(remove_poses(path, gone), remove_positions(outside, gone))
@@ -177,7 +177,7 @@ def test_a_drone_without_both_sources_coasts_and_is_then_lost() -> None:
 
 
 @pytest.mark.parametrize("which", ["inside", "outside"])
-def test_the_source_with_gross_errors_is_left_out(which) -> None:
+def test_the_source_with_gross_errors_is_left_out(which):
     path, outside, truth_m, _ = one_flight(12)
     plain = fuse(path, outside)
     rng = np.random.default_rng(12)
@@ -203,7 +203,7 @@ def test_the_source_with_gross_errors_is_left_out(which) -> None:
     assert np.linalg.norm(error_m[wrong], axis=1).max() < limit_m
 
 
-def test_identity_swaps_are_resolved() -> None:
+def test_identity_swaps_are_resolved():
     paths, outside, _ = fly_twice_seen(13, 100, num_drones=2, distance_m=1.5)
     plain = fuse(paths, outside)
     assert not plain.identity_swaps
@@ -223,7 +223,7 @@ def test_identity_swaps_are_resolved() -> None:
     assert [one.frame for one in fused.identity_swaps] == [70]
 
 
-def test_a_path_without_a_track_is_smoothed_and_a_track_without_a_path_is_kept() -> None:
+def test_a_path_without_a_track_is_smoothed_and_a_track_without_a_path_is_kept():
     paths, outside, truths = fly_twice_seen(15, 100, num_drones=2)
     path, truth_m = paths["dron1"], truths[0][0] - 20
     far = replace(path, position_m=path.position_m - 20)
@@ -238,7 +238,7 @@ def test_a_path_without_a_track_is_smoothed_and_a_track_without_a_path_is_kept()
     np.testing.assert_array_equal(found.covariance_m2[:, 2], outside.covariance_m2[:, 0])
 
 
-def test_frames_that_coast_or_have_no_information_change_nothing() -> None:
+def test_frames_that_coast_or_have_no_information_change_nothing():
     path, outside, _, _ = one_flight(17, 60)
     rows = slice(20, 40)
     status, astray_m = path.status.copy(), path.position_m.copy()
@@ -256,7 +256,7 @@ def test_frames_that_coast_or_have_no_information_change_nothing() -> None:
         assert (found.source[rows] == 2).all()
 
 
-def test_tracks_with_unknown_uncertainty_are_not_used() -> None:
+def test_tracks_with_unknown_uncertainty_are_not_used():
     path, outside, truth_m, _ = one_flight(17, 60)
     outside.covariance_m2[:50] = np.nan
     fused = fuse(path, remove_positions(outside, slice(50, 60)))
@@ -271,7 +271,7 @@ def test_tracks_with_unknown_uncertainty_are_not_used() -> None:
     shift_m=st.tuples(*[st.floats(-10, 10)] * 3),
     seed=st.integers(20, 99),
 )
-def test_turning_and_shifting_the_world_turns_and_shifts_the_result(rotvec, shift_m, seed) -> None:
+def test_turning_and_shifting_the_world_turns_and_shifts_the_result(rotvec, shift_m, seed):
     path, outside, _, _ = one_flight(seed, 60)
     turn = Rotation.from_rotvec(rotvec)
     R, middle_m = turn.as_matrix(), turn.apply(outside.position_m[:, 0]) + shift_m
@@ -287,9 +287,7 @@ def test_turning_and_shifting_the_world_turns_and_shifts_the_result(rotvec, shif
 # The command
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    return make_once(tmp_path_factory, "paths_and_tracks", make_paths_and_tracks)
+files = made_once("paths_and_tracks", make_paths_and_tracks)
 
 
 @pytest.fixture
@@ -297,14 +295,12 @@ def run_fuse(run_psotrack, files):
     """Runs `onboard fuse` on words, of which those that end in .csv without a folder are in `files`."""
 
     def call(words, *more):
-        done = run_psotrack("onboard", "fuse", *(files / word for word in words.split()), *more)
-        assert done.code == 0, done.err
-        return done.out
+        return run_psotrack("onboard", "fuse", *(files / word for word in words.split()), *more).ended().out
 
     return call
 
 
-def test_files_are_fused_into_tracks_that_other_commands_read(run_fuse, files, tmp_path) -> None:
+def test_files_are_fused_into_tracks_that_other_commands_read(run_fuse, files, tmp_path):
     out, report = tmp_path / "fused.csv", tmp_path / "report.json"
     said = run_fuse("dron1.csv dron2.csv tracks.csv", "--out", out, "--json", report)
     assert "dron1: track 0 and track 1" in said
@@ -333,7 +329,7 @@ def test_files_are_fused_into_tracks_that_other_commands_read(run_fuse, files, t
     assert drone["inside"]["scale"] > 0
 
 
-def test_options_of_the_point_and_of_the_clock(run_fuse, tmp_path) -> None:
+def test_options_of_the_point_and_of_the_clock(run_fuse, tmp_path):
     options = ("--at", "middle", "--max-offset", 0.5, "--json", "-")
     content = json.loads(run_fuse("dron2.csv tracks.csv", "--out", tmp_path / "fused.csv", *options))
     assert content["point"] == "middle"
@@ -342,7 +338,7 @@ def test_options_of_the_point_and_of_the_clock(run_fuse, tmp_path) -> None:
     assert abs(content["drones"][0]["offset_s"]) < 4 * content["drones"][0]["offset_std_s"]
 
 
-def test_drones_and_tracks_that_are_not_fused_are_kept_with_a_note(run_fuse, files, tmp_path) -> None:
+def test_drones_and_tracks_that_are_not_fused_are_kept_with_a_note(run_fuse, files, tmp_path):
     said = run_fuse("dron1.csv blind.csv tracks.csv", "--out", tmp_path / "two.csv")
     assert "dron3: no track, kept as it is" in said
     assert "nothing was fused" not in said

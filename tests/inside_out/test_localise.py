@@ -9,8 +9,8 @@ import threading
 import cv2
 import numpy as np
 import pytest
-from camera_paths import distances_m, example_path, orientations
-from helpers import make_once
+from camera_paths import AHEAD, distances_m, example_path, orientations
+from helpers import made_once
 from marker_worlds import (
     DRAWN_LENS,
     FEW_MARKERS_FRAME,
@@ -49,9 +49,7 @@ BLIND = [FEW_MARKERS_FRAME, NO_MARKERS_FRAME]
 SHOWN = np.delete(np.arange(NUM_FRAMES), BLIND)
 
 
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    return make_once(tmp_path_factory, "drawn_flight", make_drawn_flight)
+drawn = made_once("drawn_flight", make_drawn_flight)
 
 
 @pytest.fixture
@@ -66,8 +64,7 @@ def localise(run_psotrack, drawn, tmp_path):
         source = source if "//" in str(source) or source == "0" else drawn / source
         done = run_psotrack(
             "onboard", "localise", source, *room, *options, "--out", out, "--json", report, "--force"
-        )
-        assert done.code == 0, done.err
+        ).ended()
         return read_camera_path(out)[0], json.loads(report.read_text()), done.out
 
     return call
@@ -204,8 +201,7 @@ def test_a_table_may_have_centres_alone(localise, tmp_path):
 def test_a_sequence_provides_markers_and_intrinsics(run_psotrack, localise, drawn, tmp_path):
     folder = write_onboard_sequence(drawn, tmp_path / "S01_D2_A")
     out = tmp_path / "own.csv"
-    done = run_psotrack("onboard", "localise", folder, "--drone", "dron2", "--frames", 6, "--out", out)
-    assert done.code == 0, done.err
+    run_psotrack("onboard", "localise", folder, "--drone", "dron2", "--frames", 6, "--out", out).ended()
     path, name = read_camera_path(out)
     assert name == "dron2"
     assert off_m(path).max() < 0.02
@@ -395,9 +391,6 @@ def test_a_frame_without_a_solution_ends_nothing(module, stage, monkeypatch):
 
 
 # The table of a path.
-
-#: (3, 3), columns are the axes (right, down, ahead) of a camera that looks along the world's x axis.
-AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def test_angles_equal_those_of_scipy_straight_down_too():

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from camera_paths import distances_m, squared_errors
-from helpers import make_once
+from helpers import made_once, posed, simple_lens
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_worlds import (
@@ -22,9 +22,7 @@ from marker_worlds import (
     long_table,
     make_drawn_flight,
     marker_at,
-    posed,
     seen_markers,
-    simple_lens,
     wall_markers,
     wide_table,
     write_onboard_sequence,
@@ -51,7 +49,6 @@ from psotrack.inside_out.mapping.sightings import collect_sightings, outward
 from psotrack.recordings.datasets import read_marker_corners, write_marker_corners
 from psotrack.recordings.mocap import Markers, write_c3d
 
-SIDE_M = 0.4
 #: The 90 % quantile of the chi-square distribution with 3 degrees of freedom.
 NINETY = chi2.ppf(0.9, 3)
 ROOM = four_walls()
@@ -145,7 +142,7 @@ def test_maps_of_real_rooms_are_accepted(tmp_path):
     for marker in ROOM:
         measured[marker] = scaled(ROOM, marker, 0.5) + 0.002 * rng.standard_normal((4, 3))
     fronts = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
-    box = {index: marker_at(0.3 * front, front, side_m=SIDE_M) for index, front in enumerate(fronts)}
+    box = {index: marker_at(0.3 * front, front, side_m=0.4) for index, front in enumerate(fronts)}
     for corners_m in (measured, box, any_room()):
         write_marker_corners(tmp_path / "corners.csv", corners_m)
         assert len(read_marker_map(tmp_path / "corners.csv")) == len(corners_m)
@@ -241,13 +238,6 @@ def test_sightings_with_wrong_ids_are_left_out():
     assert errors_m(built).max() < 1.5 * errors_m(clean).max()
 
 
-def with_insets(seen, seed):
-    """Corners of a camera that encodes light by another power than assumed: all sides are found too far inside."""
-    rng = np.random.default_rng(seed)
-    inset_px = 0.05 * rng.normal() + 0.02 * rng.normal(size=max(ROOM) + 1)
-    return replace(seen, corners_px=seen.corners_px - inset_px[seen.marker, None, None] * outward(seen))
-
-
 @pytest.mark.parametrize(("inset", "noise_px", "least"), [(False, 0.3, 1.2), (True, 0.1, 1.8)])
 def test_the_covariance_agrees_with_the_errors(inset, noise_px, least):
     """Found: an average three quarters as large, because the covariance had whole insets.
@@ -258,7 +248,11 @@ def test_the_covariance_agrees_with_the_errors(inset, noise_px, least):
     for seed in range(4):
         seen = sightings(noise_px=noise_px, num_views=50, seed=seed)
         if inset:
-            seen = with_insets(seen, seed)
+            # A camera that encodes light by another power than assumed: all sides are found too far inside.
+            rng = np.random.default_rng(seed)
+            inset_px = 0.05 * rng.normal() + 0.02 * rng.normal(size=max(ROOM) + 1)
+            moved_px = inset_px[seen.marker, None, None] * outward(seen)
+            seen = replace(seen, corners_px=seen.corners_px - moved_px)
         built = build_map(seen, {7: ROOM[7]})
         found, unknown = built.marker_map, ~built.known
         truth = MarkerMap({marker: ROOM[marker] for marker in built.ids.tolist()})
@@ -390,21 +384,13 @@ def test_a_map_of_another_room_is_one_finding(noisy_sightings):
 # The command
 
 
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory):
-    return make_once(tmp_path_factory, "drawn_flight", make_drawn_flight)
+drawn = made_once("drawn_flight", make_drawn_flight)
 
 
 @pytest.fixture
 def run_map(run_psotrack):
     """Runs `onboard map`, which must end with an exit code; what it prints."""
-
-    def call(*words, code=0):
-        done = run_psotrack("onboard", "map", *words)
-        assert done.code == code, done.err
-        return done.out
-
-    return call
+    return lambda *words, code=0: run_psotrack("onboard", "map", *words).ended(code).out
 
 
 def centres_off_m(path):

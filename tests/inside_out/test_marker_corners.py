@@ -5,12 +5,13 @@ from functools import cache, partial
 import cv2
 import numpy as np
 import pytest
+from helpers import simple_lens
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_pictures import draw
 
 from psotrack.foreground.markers import MarkerDetector, marker_dictionary, refine_corners
-from psotrack.geometry import distort, make_camera
+from psotrack.geometry import distort
 
 SQUARE = np.array([[260.0, 180.0], [360.0, 170.0], [370.0, 275.0], [255.0, 280.0]])
 OBLIQUE = np.array([[100.0, 100.0], [140.0, 108.0], [139.0, 190.0], [101.0, 200.0]])
@@ -137,12 +138,11 @@ def test_small_markers_in_large_images_are_found():
 
 
 def test_corners_are_right_in_images_of_a_lens_with_distortion():
-    K = np.array([[400.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1]])
-    dist = (-0.2, 0.05, 0.001, -0.001)
-    lens = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=(640, 480), dist=dist)
+    lens = simple_lens(400.0, (640, 480), (-0.2, 0.05, 0.001, -0.001))
+    middle_px = lens.K[:2, 2]
     straight = np.array([[40.0, 30.0], [170.0, 25.0], [165.0, 155.0], [45.0, 160.0]])
-    rays = (straight - K[:2, 2]) / 400
-    corners = np.stack(distort(lens, *rays.T), axis=-1) * 400 + K[:2, 2]
+    rays = (straight - middle_px) / 400
+    corners = np.stack(distort(lens, *rays.T), axis=-1) * 400 + middle_px
     image = draw([(5, straight)], lens=lens, fine=4)
     # Measured 0.04; parabolas through the bent edges miss the corners by 0.28, straight lines by 0.85.
     assert errors_px(image, {5: corners}, lens=lens).max() < 0.1

@@ -72,11 +72,6 @@ def pose_error(found, view):
     return np.concatenate([view.centre_world - found.position_m, turn])
 
 
-def squared_deviations(found, view):
-    off = pose_error(found, view)
-    return off @ np.linalg.solve(found.covariance, off)
-
-
 #: Coefficients, and whether the lens is a fisheye.
 LENS_MODELS = [(dist, False) for dist in LENSES.values()]
 LENS_MODELS.append(((-0.02, 0.01, -0.01, 0.002), True))
@@ -115,12 +110,6 @@ def inward(corners_px):
     return into / np.linalg.norm(into, axis=-1, keepdims=True)
 
 
-def own_whitener(std_px):
-    """(8, 8), inverse root of the covariance of a marker's corners, whose mean has 0.48 of independent errors' std."""
-    mean = np.kron(np.full((4, 4), 0.25), np.eye(2))
-    return (np.eye(8) + (1 / 0.48 - 1) * mean) / std_px
-
-
 def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
     """Unknowns: pose, inset, focal length, markers' offsets; the noise of each marker is another.
 
@@ -150,7 +139,9 @@ def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
         return project(there, corners_m + x[8:].reshape(count, 1, 3))[0]
 
     def best_for(corners_px, start, factor=1.0):
-        whiteners = [own_whitener(std) / np.sqrt(factor) for std in std_px]
+        # Inverse roots of the covariances of corners, whose mean has 0.48 of independent errors' deviation.
+        root = np.eye(8) + (1 / 0.48 - 1) * np.kron(np.full((4, 4), 0.25), np.eye(2))
+        whiteners = [root / std / np.sqrt(factor) for std in std_px]
         place_std_m = np.hypot(0.0024 * np.sqrt(factor), map_error_m)
         inset = inward(corners_px)
 
@@ -225,7 +216,8 @@ def test_markers_with_the_id_of_another_are_left_out(wrong):
             mapped_m[index] = corners_m[rng.choice(others)]
         found = estimated(view, corners_px, mapped_m)
         np.testing.assert_array_equal(np.flatnonzero(~found.used), np.sort(swapped))
-        assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
+        off = pose_error(found, view)
+        assert off @ np.linalg.solve(found.covariance, off) < chi2.ppf(0.9999, 6)
 
 
 def test_a_marker_that_the_map_places_behind_the_camera_is_left_out():

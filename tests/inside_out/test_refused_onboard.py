@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from camera_paths import example_path, fly_twice_seen, make_paths_and_tracks, remove_poses, remove_positions
-from helpers import assert_refused, make_once
+from helpers import assert_refused, calls, make_once, simple_lens
 from marker_worlds import (
     DRAWN_LENS,
     PASSING_CAMERA,
@@ -18,7 +18,6 @@ from marker_worlds import (
     four_walls,
     long_table,
     make_drawn_flight,
-    simple_lens,
     wide_table,
 )
 
@@ -48,11 +47,6 @@ from psotrack.inside_out.pose import CornerNoise, estimate_pose
 from psotrack.recordings.mocap import Markers, write_c3d
 
 ROOM = four_walls()
-
-
-def calls(function, *arguments, **options):
-    """A call that needs no file."""
-    return lambda folder, run: partial(function, *arguments, **options)
 
 
 def localises(options, video="{flight}", lens="--fov 70,55.4"):
@@ -252,18 +246,14 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """The files of a drawn flight, and of paths and tracks."""
+@pytest.mark.parametrize(("prepare", "words"), [(one, words) for one, *words in BAD.values()], ids=BAD)
+def test_bad_input_is_refused_in_one_line(prepare, words, tmp_path_factory, run_psotrack, tmp_path):
     drawn = make_once(tmp_path_factory, "drawn_flight", make_drawn_flight)
     flown = make_once(tmp_path_factory, "paths_and_tracks", make_paths_and_tracks)
-    return {path.stem: path for path in (*drawn.iterdir(), *flown.iterdir())}
+    paths = {path.stem: path for path in (*drawn.iterdir(), *flown.iterdir())}
+    paths |= {"tmp": tmp_path, "new": tmp_path / "new.csv"}
 
-
-@pytest.mark.parametrize(("prepare", "words"), [(one, words) for one, *words in BAD.values()], ids=BAD)
-def test_bad_input_is_refused_in_one_line(prepare, words, files, run_psotrack, tmp_path):
     def run(line):
-        paths = files | {"tmp": tmp_path, "new": tmp_path / "new.csv"}
         return run_psotrack("onboard", *(word.format(**paths) for word in line.split()))
 
     assert_refused(prepare(tmp_path, run), *words, unchanged=tmp_path)

@@ -1,12 +1,8 @@
 """Frames of live cameras: streams bring them with their times, they meet at instants, and what is filmed is kept."""
 
-from __future__ import annotations
-
 import shutil
 import threading
-from collections.abc import Iterable
 from operator import itemgetter
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_sweeps import wait_until
 
-from psotrack.live import CameraRecorder, Instant, Meeting, StreamClock, recording_folder
+from psotrack.live import CameraRecorder, Meeting, StreamClock, recording_folder
 from psotrack.recordings import FrameTimes, Recording, VideoEncoder, make_timeline, probe, read_frames
 from psotrack.recordings.datasets import open_recording
 
@@ -30,7 +26,7 @@ RIG = ring_rig(3, image_size_wh=SIZE_WH)
 # --- times
 
 
-def clock_times(stream_s: np.ndarray, arrived_s: np.ndarray) -> tuple[np.ndarray, list[bool | None]]:
+def clock_times(stream_s, arrived_s):
     """The times of a stream's frames, and whether the stream's own times are used."""
     clock = StreamClock()
     times_s, is_used = [], []
@@ -41,7 +37,7 @@ def clock_times(stream_s: np.ndarray, arrived_s: np.ndarray) -> tuple[np.ndarray
 
 
 @pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4])
-def test_jitter_is_removed_from_the_times_of_a_stream(drift: float) -> None:
+def test_jitter_is_removed_from_the_times_of_a_stream(drift):
     rng = np.random.default_rng(0)
     filmed_s = 1000 + np.arange(1000) / FPS
     arrived_s = np.maximum.accumulate(filmed_s + 0.08 + rng.exponential(0.02, len(filmed_s)))
@@ -55,7 +51,7 @@ def test_jitter_is_removed_from_the_times_of_a_stream(drift: float) -> None:
     assert np.abs(arrived_s - expected_s)[used].max() > 0.05
 
 
-def test_times_that_are_no_times_of_this_clock_are_not_used() -> None:
+def test_times_that_are_no_times_of_this_clock_are_not_used():
     number = np.arange(500)
     arrived_s = 1000 + number / FPS
     no_times_s = np.zeros(500)
@@ -68,7 +64,7 @@ def test_times_that_are_no_times_of_this_clock_are_not_used() -> None:
         np.testing.assert_array_equal(times_s, arrived_s)
 
 
-def test_a_frame_that_the_stream_does_not_count_is_noticed() -> None:
+def test_a_frame_that_the_stream_does_not_count_is_noticed():
     """Invented times of the right rate fall behind by an interval with each frame that the camera drops."""
     number = np.delete(np.arange(750), 400)
     arrived_s = 1000 + number / FPS
@@ -84,28 +80,28 @@ def test_a_frame_that_the_stream_does_not_count_is_noticed() -> None:
 # --- instants
 
 
-def _image(number: int) -> np.ndarray:
+def _image(number):
     """A silhouette that tells the number of its frame."""
     return np.array([[number % 256, number // 256]], np.uint8)
 
 
-def _number(image: np.ndarray | None) -> int:
+def _number(image):
     return -1 if image is None else int(image[0, 0]) + 256 * int(image[0, 1])
 
 
-def _put(meeting: Meeting, camera: int, number: int, time_s: float, now_s: float) -> bool:
+def _put(meeting, camera, number, time_s, now_s):
     is_back = meeting.announce(camera, time_s, now_s)
     meeting.put(camera, time_s, _image(number), now_s)
     return is_back
 
 
-def _meeting(count: int = 3, fps: float = 25.0) -> Meeting:
+def _meeting(count=3, fps=25.0):
     meeting = Meeting([fps] * count, fps, wait_s=WAIT_S)
     meeting.began_s = 0.0
     return meeting
 
 
-def _all(meeting: Meeting, now_s: float) -> list[Instant]:
+def _all(meeting, now_s):
     taken = []
     while (instant := meeting.take(now_s)) is not None:
         taken.append(instant)
@@ -127,7 +123,7 @@ def test_frames_meet_as_on_the_timeline_of_a_recording(rates, offsets, data):
     timeline = make_timeline(times)
     meeting = Meeting(rates, timeline.rate_hz, wait_s=WAIT_S, first_s=float(timeline.time_s[0]))
     shuffled = data.draw(st.permutations(coming))
-    taken: list[Instant] = []
+    taken = []
     for time_s, camera, number in sorted(shuffled, key=itemgetter(0)):
         _put(meeting, camera, number, time_s, time_s)
         taken += _all(meeting, time_s)
@@ -150,7 +146,7 @@ def test_frames_meet_as_on_the_timeline_of_a_recording(rates, offsets, data):
         assert camera.counts.late == camera.counts.doubled == 0
 
 
-def test_an_instant_waits_for_a_frame_and_not_for_ever() -> None:
+def test_an_instant_waits_for_a_frame_and_not_for_ever():
     meeting = _meeting()
     _put(meeting, 0, 0, 0.0, 10.0)
     _put(meeting, 1, 0, 0.001, 10.01)
@@ -196,7 +192,7 @@ def test_a_doubled_frame_counts_once_and_the_meeting_ends_when_all_cameras_have(
     assert meeting.has_ended
 
 
-def test_a_camera_that_stops_is_not_waited_for_and_comes_back() -> None:
+def test_a_camera_that_stops_is_not_waited_for_and_comes_back():
     meeting = _meeting()
     came_back, stopped = [], []
     for frame in range(100):
@@ -224,7 +220,7 @@ def test_a_camera_that_stops_is_not_waited_for_and_comes_back() -> None:
 
 
 @pytest.fixture
-def laboratory(tmp_path: Path) -> Recording:
+def laboratory(tmp_path):
     """Three cameras on the network, with bounds, an image of what is ignored, and a rolling shutter."""
     ignore = tmp_path / "trees.png"
     cv2.imwrite(f"{ignore}", np.zeros(SIZE_WH[::-1], np.uint8))
@@ -241,12 +237,12 @@ def laboratory(tmp_path: Path) -> Recording:
     )
 
 
-def noise(index: int) -> np.ndarray:
+def noise(index):
     width, height = SIZE_WH
     return np.random.default_rng(index).integers(0, 255, (height, width, 3), dtype=np.uint8)
 
 
-def record(recorder: CameraRecorder, images: Iterable[np.ndarray], first: int = 0) -> None:
+def record(recorder, images, first=0):
     """Record frames at 25 Hz, as fast as they are encoded."""
     times = recorder.times
     for count, image in enumerate(images, start=1):
@@ -255,7 +251,7 @@ def record(recorder: CameraRecorder, images: Iterable[np.ndarray], first: int = 
         wait_until(lambda count=count: times.exists() and times.read_text().count("\n") > count)
 
 
-def test_what_was_filmed_is_a_recording(laboratory: Recording, tmp_path: Path) -> None:
+def test_what_was_filmed_is_a_recording(laboratory, tmp_path):
     """One camera starts later, and another one never films."""
     folder = tmp_path / "flight"
     width, height = SIZE_WH
@@ -284,7 +280,7 @@ def test_what_was_filmed_is_a_recording(laboratory: Recording, tmp_path: Path) -
         np.testing.assert_allclose(levels, 2 * numbers, rtol=0, atol=3.7)
 
 
-def test_a_frame_that_comes_twice_is_kept_once(tmp_path: Path) -> None:
+def test_a_frame_that_comes_twice_is_kept_once(tmp_path):
     recorder = CameraRecorder(tmp_path, "cam1", FPS)
     for time_s in (0.0, 0.04, 0.04, 0.02, 0.08):
         recorder.write(noise(0), time_s)
@@ -293,11 +289,11 @@ def test_a_frame_that_comes_twice_is_kept_once(tmp_path: Path) -> None:
     assert recorder.times.read_text() == "frame,time_s\n0,0.0\n1,0.04\n2,0.08\n"
 
 
-def test_nobody_waits_for_the_codec(tmp_path: Path, monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_nobody_waits_for_the_codec(tmp_path, monkeypatch, caplog):
     """While the codec is busy, frames are left out and counted, and this is said once."""
     is_free, encode = threading.Event(), VideoEncoder.write
 
-    def wait(encoder: VideoEncoder, image: np.ndarray) -> None:
+    def wait(encoder, image):
         is_free.wait()
         encode(encoder, image)
 
@@ -314,7 +310,7 @@ def test_nobody_waits_for_the_codec(tmp_path: Path, monkeypatch, caplog: pytest.
     assert caplog.messages == [said]
 
 
-def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path) -> None:
+def test_a_crash_leaves_what_was_recorded(laboratory, tmp_path):
     """What is in the files before the recording ends is what a killed process leaves."""
     folder, name = tmp_path / "flight", RIG.names[0]
     with recording_folder(folder, laboratory, [name]):
@@ -328,7 +324,7 @@ def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path)
     assert len([*read_frames(camera.video)]) == camera.times.num_frames
 
 
-def test_a_recording_that_does_not_fit_keeps_what_fits(tmp_path: Path, caplog) -> None:
+def test_a_recording_that_does_not_fit_keeps_what_fits(tmp_path, caplog):
     """A limit on the size of files stands for a full disk, of which FFmpeg says nothing."""
     recorder = CameraRecorder(tmp_path, "cam1", FPS)
     with files_up_to(500_000):
@@ -351,7 +347,7 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_in_time(tmp_path, caplog)
     assert "less than 1000000000000 MB of free disk space; what was recorded before stays" in said
 
 
-def test_the_folder_of_a_recording_keeps_other_files(laboratory: Recording, tmp_path: Path) -> None:
+def test_the_folder_of_a_recording_keeps_other_files(laboratory, tmp_path):
     folder = tmp_path / "flight"
     # Of cameras that never film nothing stays, so that the second session is not refused.
     for _ in range(2):
@@ -374,7 +370,7 @@ BAD_FOLDERS = {
 
 
 @pytest.mark.parametrize("folder", BAD_FOLDERS)
-def test_a_folder_that_cannot_hold_a_recording(folder, laboratory: Recording, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_hold_a_recording(folder, laboratory, tmp_path):
     (tmp_path / "file").write_text("")
     recording = laboratory.with_rig(ring_rig(3, image_size_wh=(321 if folder == "odd" else 320, 240)))
     block = recording_folder(tmp_path / folder, recording, RIG.names, force=True)

@@ -4,8 +4,6 @@ Cameras on the network, their streams and the clients of WebSockets have real so
 one line, and the others go on.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import http.server
@@ -18,22 +16,17 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
-from types import ModuleType
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
-import worlds
-from helpers import assert_refused, listening_at, make_once
+from helpers import assert_refused, listening_at, made_once
 from small_sweeps import wait_until
 
 from psotrack.geometry.rig_files import write_rig
 from psotrack.live import (
     CameraStream,
-    LiveResult,
     LiveSession,
     SourceFrame,
     UdpLines,
@@ -74,12 +67,12 @@ class NetworkCamera(http.server.ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, parts: Callable[[], Iterable[bytes]], kind: str = MJPEG, port: int = 0) -> None:
+    def __init__(self, parts, kind=MJPEG, port=0):
         camera = self
         self.has_ended = False
 
         class Handler(http.server.BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
+            def do_GET(self):
                 if self.path == "/nothing":
                     self.send_error(404)
                     return
@@ -94,33 +87,33 @@ class NetworkCamera(http.server.ThreadingHTTPServer):
                 except OSError:  # the client has gone
                     return
 
-            def log_message(self, *arguments: object) -> None:
+            def log_message(self, *arguments):
                 pass
 
         super().__init__(("127.0.0.1", port), Handler)
         threading.Thread(target=self.serve_forever, daemon=True).start()
 
     @property
-    def address(self) -> str:
+    def address(self):
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
-    def stop(self) -> None:
+    def stop(self):
         """End all connections, and answer no others."""
         self.has_ended = True
         self.shutdown()
         self.server_close()
 
 
-def jpeg_part(image: np.ndarray) -> bytes:
+def jpeg_part(image):
     coded = cv2.imencode(".jpg", image)[1].tobytes()
     head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(coded)}\r\n\r\n"
     return head.encode() + coded + b"\r\n"
 
 
-def timed(parts: list[bytes], at_s: np.ndarray) -> Callable[[], Iterator[bytes]]:
+def timed(parts, at_s):
     """Parts that come at given times after a connection's beginning."""
 
-    def stream() -> Iterator[bytes]:
+    def stream():
         began_s = time.monotonic()
         for part, part_s in zip(parts, at_s.tolist(), strict=True):
             time.sleep(max(0.0, began_s + part_s - time.monotonic()))
@@ -129,11 +122,11 @@ def timed(parts: list[bytes], at_s: np.ndarray) -> Callable[[], Iterator[bytes]]
     return stream
 
 
-def film(video: Path, port: int = 0) -> NetworkCamera:
+def film(video, port=0):
     """A camera that sends the frames of a video again and again, 10 per second, as a busy machine must keep up."""
     parts = [jpeg_part(image) for image in read_frames(probe(video))]
 
-    def stream() -> Iterator[bytes]:
+    def stream():
         while True:
             # All cameras show the same moment, as cameras of one room do.
             yield parts[int(time.time() * 10) % len(parts)]
@@ -142,7 +135,7 @@ def film(video: Path, port: int = 0) -> NetworkCamera:
     return NetworkCamera(stream, port=port)
 
 
-def laboratory_of(folder: Path, sequence: Path, keys: Mapping[str, str]) -> Path:
+def laboratory_of(folder, sequence, keys):
     """A recording.toml with the rig of a sequence, and TOML keys of some of its cameras."""
     write_rig(folder / "rig.toml", open_recording(sequence).rig.select(list(keys)))
     tables = "".join(f"[cameras.{name}]\n{text}\n" for name, text in keys.items())
@@ -151,18 +144,18 @@ def laboratory_of(folder: Path, sequence: Path, keys: Mapping[str, str]) -> Path
     return path
 
 
-def wait_for_lines(path: Path, count: int) -> None:
+def wait_for_lines(path, count):
     wait_until(lambda: path.exists() and path.read_text().count("\n") >= count)
 
 
-def free_port() -> int:
+def free_port():
     """A port at which nobody listens."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return one.getsockname()[1]
 
 
-def rows_of(frame: int, num_drones: int = 4) -> Trajectories:
+def rows_of(frame, num_drones=4):
     """Rows of an instant, which differ from frame to frame."""
     shape = (1, num_drones, 3)
     return Trajectories(
@@ -180,9 +173,9 @@ def rows_of(frame: int, num_drones: int = 4) -> Trajectories:
 
 
 @pytest.fixture
-def cameras() -> Iterator[list[NetworkCamera]]:
+def cameras():
     """Cameras that are stopped after the test."""
-    made: list[NetworkCamera] = []
+    made = []
     yield made
     for camera in made:
         if not camera.has_ended:
@@ -190,7 +183,7 @@ def cameras() -> Iterator[list[NetworkCamera]]:
 
 
 @pytest.fixture
-def taken(cameras: list[NetworkCamera]) -> Callable[..., tuple[list[SourceFrame], list[float], list[str]]]:
+def taken(cameras):
     """Gives the frames of a stream until it breaks off, their ages when they are taken, and what is said."""
 
     def take(parts, at_s, work_s=0.0, kind=MJPEG):
@@ -260,7 +253,7 @@ def test_the_times_of_a_stream_are_used_and_said(taken, tmp_path, caplog):
     assert np.median(np.abs(arrived_apart_s - 1 / 25)) > 0.004
 
 
-def client() -> ModuleType:
+def client():
     """Clients of WebSockets, if they are installed."""
     return pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
 
@@ -268,40 +261,32 @@ def client() -> ModuleType:
 # --- sessions
 
 
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def make_sequence(folder):
     """A simulated flight of four drones."""
-
-    def make(folder: Path) -> None:
-        recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners"})
-        settings = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
-        simulate(recipe, folder, settings, jobs=1)
-
-    return make_once(tmp_path_factory, "live_sequence", make) / "Simulated_Data" / "S02_D4_A"
+    recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners"})
+    settings = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    simulate(recipe, folder, settings, jobs=1)
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A smaller flight, for what needs no drones that can be tracked."""
-    return worlds.two_flights(tmp_path_factory) / "flight"
+sequence = made_once("live_sequence", make_sequence, "Simulated_Data/S02_D4_A")
 
 
 @pytest.fixture
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cache(tmp_path_factory):
     return tmp_path_factory.getbasetemp() / "live_cache"
 
 
 @pytest.fixture
-def meanwhile() -> Iterator[Callable[[Callable[[], object]], None]]:
+def meanwhile():
     """Does something in a thread while the test runs, and raises its error at the end of the test."""
-    done: list[Future] = []
+    done = []
 
-    def end_the_session(future: Future) -> None:
+    def end_the_session(future):
         # The session in the main thread would wait for ever.
         if future.exception() is not None:
             os.kill(os.getpid(), signal.SIGINT)
 
-    def start(work: Callable[[], object]) -> None:
+    def start(work):
         done.append(pool.submit(work))
         done[-1].add_done_callback(end_the_session)
 
@@ -312,11 +297,11 @@ def meanwhile() -> Iterator[Callable[[Callable[[], object]], None]]:
 
 
 @contextlib.contextmanager
-def datagrams() -> Iterator[tuple[str, list[str]]]:
+def datagrams():
     """The address of a receiver, and what has come to it when the block ends."""
     sent = list[str]()
 
-    def take() -> None:
+    def take():
         # Taken as they come: the system keeps only some hundred of them.
         while (text := receiver.recv(65536).decode()) != "end":
             sent.append(text)
@@ -332,8 +317,8 @@ def datagrams() -> Iterator[tuple[str, list[str]]]:
 
 @pytest.mark.slow
 def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
-    sequence: Path, cache: Path, tmp_path: Path, run_psotrack, meanwhile
-) -> None:
+    sequence, cache, tmp_path, run_psotrack, meanwhile
+):
     keys = {name: f'video = "{sequence / name}i_s.avi"\n' for name in CAMERAS}
     # Two of the cameras have rolling shutters: a frame has the time of its middle row, 2.7 ms after its first row.
     for name in CAMERAS[:2]:
@@ -342,11 +327,11 @@ def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
     common = ["--cache", cache, *EFFORT]
     port, received = free_port(), list[str]()
 
-    def answers() -> bool:
+    def answers():
         with socket.socket() as one:
             return one.connect_ex(("127.0.0.1", port)) == 0
 
-    def listen() -> None:
+    def listen():
         wait_until(answers)
         assert listening_at(os.getpid()) == {"127.0.0.1"}
         with client().connect(f"ws://127.0.0.1:{port}") as connection:
@@ -359,8 +344,7 @@ def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
         live = run_psotrack(
             *("live", recording, "--replay", "--speed", SPEED, "--out", tmp_path / "live.csv", "--lines"),
             *("--udp", address, "--websocket", port, "--record", tmp_path / "kept", *common),
-        )
-    assert live.code == 0, live.err
+        ).ended()
     assert f"rows are sent to clients of ws://127.0.0.1:{port}\n" in live.err
     assert sent == live.out.splitlines()
     # The client may come after the first rows.
@@ -384,8 +368,7 @@ def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
     # The last frame comes when all others are over.
     fastest = float(SPEED) * NUM_FRAMES / (NUM_FRAMES - 1)
     assert 0 < record["real_time_factor"] < record["real_time_factor_running"] <= fastest
-    offline = run_psotrack("track", recording, "--causal", "--out", tmp_path / "off.csv", *common)
-    assert offline.code == 0, offline.err
+    run_psotrack("track", recording, "--causal", "--out", tmp_path / "off.csv", *common).ended()
     assert (tmp_path / "live.csv").read_bytes() == (tmp_path / "off.csv").read_bytes()
     twin = json.loads((tmp_path / "off.json").read_text())
     same = ("sequence", "causal", "cameras", "rate_hz", "settings", "seed", "volume", "drones", "versions")
@@ -404,15 +387,15 @@ def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
         assert np.isin(kept.by_name[name].times.time_s, filmed_s).all()
 
 
-def filmed_by(videos: list[str]) -> dict[str, str]:
+def filmed_by(videos):
     """TOML keys of the cameras with these videos."""
     return {name: f"video = {video}\nfps = 10" for name, video in zip(CAMERAS, videos, strict=True)}
 
 
 @pytest.mark.slow
 def test_cameras_stop_come_back_are_missing_or_send_another_size(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: list[NetworkCamera], run_psotrack, meanwhile, caplog
-) -> None:
+    sequence, cache, tmp_path, cameras, run_psotrack, meanwhile, caplog
+):
     """One camera breaks off and comes back, a device is not there, and a camera sends another size."""
     cameras += [film(sequence / "cam1i_s.avi"), film(sequence / "cam2i_s.avi")]
     cameras.append(NetworkCamera(lambda: iter([jpeg_part(np.zeros((48, 64, 3), np.uint8))] * 9)))
@@ -420,7 +403,7 @@ def test_cameras_stop_come_back_are_missing_or_send_another_size(
     videos = [f'"{cameras[0].address}"', f'"{cameras[1].address}"', "63", f'"{wrong}"']
     laboratory, table = laboratory_of(tmp_path, sequence, filmed_by(videos)), tmp_path / "live.csv"
 
-    def stop_and_film() -> None:
+    def stop_and_film():
         wait_for_lines(table, 20)
         gone = cameras[1]
         gone.stop()
@@ -434,8 +417,7 @@ def test_cameras_stop_come_back_are_missing_or_send_another_size(
     meanwhile(stop_and_film)
     done = run_psotrack(
         *("live", laboratory, "--out", table, "--record", tmp_path / "kept", "--cache", cache, *EFFORT)
-    )
-    assert done.code == 0, done.err
+    ).ended()
     record = json.loads((tmp_path / "live.json").read_text())
     assert record["camera_frames"]["cam2"]["stops"] >= 1
     assert record["camera_frames"]["cam2"]["frames"] > 0
@@ -453,8 +435,8 @@ def test_cameras_stop_come_back_are_missing_or_send_another_size(
 
 @pytest.mark.slow
 def test_without_two_cameras_that_film_the_command_ends(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: list[NetworkCamera], run_psotrack, caplog
-) -> None:
+    sequence, cache, tmp_path, cameras, run_psotrack, caplog
+):
     cameras.append(film(sequence / "cam1i_s.avi"))
     silent = f"http://127.0.0.1:{free_port()}/"
     videos = filmed_by([f'"{cameras[0].address}"', f'"{silent}"', "63", "63"])
@@ -462,8 +444,7 @@ def test_without_two_cameras_that_film_the_command_ends(
     done = run_psotrack(
         *("live", laboratory, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept"),
         *("--cache", cache, *EFFORT),
-    )
-    assert done.code == 2
+    ).ended(2)
     last = "expected at least two cameras that film, found 1 of 4; the lines above say why"
     assert done.err == f"psotrack: the cameras: {last}\n"
     said = "\n".join(caplog.messages)
@@ -474,13 +455,13 @@ def test_without_two_cameras_that_film_the_command_ends(
 
 
 @pytest.mark.slow
-def test_a_camera_whose_process_dies_is_one_line_and_the_others_go_on(sequence: Path, caplog) -> None:
+def test_a_camera_whose_process_dies_is_one_line_and_the_others_go_on(sequence, caplog):
     recording = open_recording(sequence)
     effort = TrackSettings().changed({"swarm.particles": 20, "swarm.iterations": 15})
     cameras = live_cameras(recording, replay=True, speed=float(SPEED))
     session = LiveSession(recording, cameras, effort, most_drones=1, wait_s=0.5)
 
-    def kill_one(result: LiveResult) -> None:
+    def kill_one(result):
         if result.instants == 5:
             multiprocessing.active_children()[0].kill()
 
@@ -499,9 +480,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_done_is_one_line(
-    name: str, flight: Path, tmp_path: Path, monkeypatch, run_psotrack
-) -> None:
+def test_what_cannot_be_done_is_one_line(name, flight, tmp_path, monkeypatch, run_psotrack):
     options, words = BAD[name]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PSOTRACK_CACHE", str(flight.parent / "cache"))
@@ -511,13 +490,13 @@ def test_what_cannot_be_done_is_one_line(
 # --- What goes wrong
 
 
-def first_line(address: str) -> str:
+def first_line(address):
     """What a source says first."""
     with contextlib.closing(CameraStream(address, (64, 48)).frames(time.monotonic, lambda: False)) as source:
         return next(source)
 
 
-def test_each_reason_why_a_stream_is_silent_is_said(cameras: list[NetworkCamera], monkeypatch) -> None:
+def test_each_reason_why_a_stream_is_silent_is_said(cameras, monkeypatch):
     monkeypatch.setattr("psotrack.live.sources._AGAIN_S", 0.0)
     monkeypatch.setattr("psotrack.live.sources.ANSWER_S", 0.5)
     silent = free_port()
@@ -536,7 +515,7 @@ def test_each_reason_why_a_stream_is_silent_is_said(cameras: list[NetworkCamera]
     assert first_line(address) == f"{expected}; {AGAIN}"
 
 
-def test_each_reason_why_a_device_is_silent_is_said(tmp_path: Path, monkeypatch) -> None:
+def test_each_reason_why_a_device_is_silent_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr("psotrack.live.sources._AGAIN_S", 0.0)
     file = tmp_path / "video0"
     file.touch()
@@ -550,8 +529,8 @@ def test_each_reason_why_a_device_is_silent_is_said(tmp_path: Path, monkeypatch)
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_other_outputs_go_on_where_disks_are_full(
-    sequence: Path, cache: Path, tmp_path: Path, run_psotrack, monkeypatch, caplog
-) -> None:
+    sequence, cache, tmp_path, run_psotrack, monkeypatch, caplog
+):
     """The table and the lines meet a full disk, so that the datagrams alone go on."""
     table = tmp_path / "live.csv"
     table.symlink_to("/dev/full")
@@ -573,7 +552,7 @@ def test_other_outputs_go_on_where_disks_are_full(
     assert max(json.loads(row)["frame"] for row in sent) >= NUM_FRAMES - 10
 
 
-def test_an_unreachable_network_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreachable_network_stops_nothing(caplog):
     # The system refuses to send to all hosts unless a program asks for it.
     with contextlib.closing(UdpLines("255.255.255.255:9")) as udp:
         for frame in range(3):
@@ -583,14 +562,14 @@ def test_an_unreachable_network_stops_nothing(caplog: pytest.LogCaptureFixture) 
     assert caplog.messages == [f"--udp 255.255.255.255:9: {found}"]
 
 
-def test_a_signal_that_comes_while_another_one_stops_the_session(flight: Path) -> None:
+def test_a_signal_that_comes_while_another_one_stops_the_session(flight):
     """A signal handler that interrupted itself waited for ever."""
     recording = open_recording(flight)
     session = LiveSession(recording, live_cameras(recording, replay=True), TrackSettings())
     before = signal.signal(signal.SIGINT, lambda *_: session.stop())
     is_over = threading.Event()
 
-    def send() -> None:
+    def send():
         while not is_over.is_set():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1e-4)  # so that not more handlers interrupt each other than Python allows
@@ -611,19 +590,19 @@ def test_a_signal_that_comes_while_another_one_stops_the_session(flight: Path) -
 
 
 @pytest.fixture
-def port() -> int:
+def port():
     client()
     return free_port()
 
 
 @pytest.fixture
-def server(port: int) -> Iterator[WebSocketLines]:
+def server(port):
     server = WebSocketLines(f"{port}")
     yield server
     server.close()
 
 
-def connected(port: int, server: WebSocketLines, **options: object):
+def connected(port, server, **options):
     """A client, once the server knows it."""
     before = server.num_clients
     connection = client().connect(f"ws://127.0.0.1:{port}", **options)
@@ -631,7 +610,7 @@ def connected(port: int, server: WebSocketLines, **options: object):
     return connection
 
 
-def deaf_client(port: int, server: WebSocketLines) -> socket.socket:
+def deaf_client(port, server):
     """A client that connects and never reads a message."""
     before = server.num_clients
     one = socket.socket()
@@ -645,7 +624,7 @@ def deaf_client(port: int, server: WebSocketLines) -> socket.socket:
     return one
 
 
-def test_all_clients_get_every_row_as_a_message_before_the_end(port: int) -> None:
+def test_all_clients_get_every_row_as_a_message_before_the_end(port):
     server = WebSocketLines(f"127.0.0.1:{port}")
     server.write(rows_of(0))  # nobody listens yet
     with connected(port, server) as first, connected(port, server) as second:
@@ -662,7 +641,7 @@ def test_all_clients_get_every_row_as_a_message_before_the_end(port: int) -> Non
     assert np.allclose(row["position_m"], rows_of(1).position_m[0, 0])
 
 
-def test_a_client_that_never_reads_is_disconnected_and_slows_nobody(port: int) -> None:
+def test_a_client_that_never_reads_is_disconnected_and_slows_nobody(port):
     server = WebSocketLines(f"{port}", asked_s=0.4)
     num_bytes = frame = 0
     with contextlib.closing(server), deaf_client(port, server) as deaf, connected(port, server) as connection:
@@ -684,7 +663,7 @@ def test_a_client_that_never_reads_is_disconnected_and_slows_nobody(port: int) -
         assert num_read < 0.9 * num_bytes
 
 
-def test_a_client_that_does_not_read_cannot_hold_up_the_end(port: int) -> None:
+def test_a_client_that_does_not_read_cannot_hold_up_the_end(port):
     server = WebSocketLines(f"{port}")
     with deaf_client(port, server):
         # More than the system's buffers take, and less than what may wait in the server, so that it is connected.
@@ -694,7 +673,7 @@ def test_a_client_that_does_not_read_cannot_hold_up_the_end(port: int) -> None:
         server.close()
 
 
-def test_only_pages_of_this_computer_may_read(port: int, server: WebSocketLines) -> None:
+def test_only_pages_of_this_computer_may_read(port, server):
     with connected(port, server, origin="http://localhost:8000") as connection:
         server.write(rows_of(0, 1))
         assert json.loads(connection.recv(timeout=10))["frame"] == 0
@@ -702,27 +681,16 @@ def test_only_pages_of_this_computer_may_read(port: int, server: WebSocketLines)
         client().connect(f"ws://127.0.0.1:{port}", origin="https://example.com")
 
 
-#: Address -> words of the line.
-BAD_ADDRESSES = {
-    **dict.fromkeys(
-        ("", "nowhere", "127.0.0.1:", "9000:", "0", "70000", "1.5", "٣"),
-        "--websocket: expected PORT or HOST:PORT",
-    ),
-    "no.such.host.invalid:9000": "expected an address of this computer",
-}
+NO_ADDRESSES = ("", "nowhere", "127.0.0.1:", "9000:", "0", "70000", "1.5", "٣")
 
 
-@pytest.mark.usefixtures("port")
-@pytest.mark.parametrize("address", BAD_ADDRESSES)
-def test_an_address_that_is_none(address: str, tmp_path: Path) -> None:
-    assert_refused(lambda: WebSocketLines(address), BAD_ADDRESSES[address], unchanged=tmp_path)
-
-
-def test_a_port_in_use_is_one_line(port: int, server: WebSocketLines, tmp_path: Path) -> None:
-    words = "expected an address of this computer that is free", "in use"
-    assert_refused(lambda: WebSocketLines(f"{port}"), *words, unchanged=tmp_path)
-
-
-def test_without_the_package_the_error_says_how_to_install_it(tmp_path: Path, monkeypatch) -> None:
+def test_an_address_that_is_none_a_port_in_use_and_a_missing_package_are_one_line(
+    port, server, tmp_path, monkeypatch
+):
+    refusals = {key: ["--websocket: expected PORT or HOST:PORT"] for key in NO_ADDRESSES}
+    refusals["no.such.host.invalid:9000"] = ["expected an address of this computer"]
+    refusals[f"{port}"] = ["expected an address of this computer that is free", "in use"]
+    for address, words in refusals.items():
+        assert_refused(lambda address=address: WebSocketLines(address), *words, unchanged=tmp_path)
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
     assert_refused(lambda: WebSocketLines("9000"), "pip install '.[live]'", unchanged=tmp_path)

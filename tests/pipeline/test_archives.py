@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives_made import OLD
-from helpers import assert_refused, files_up_to, make_once
+from helpers import assert_refused, files_up_to, made_once, make_once
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -28,10 +28,8 @@ CONTENT = OLD.read_bytes()
 FILES = {"tracks.csv": b"frame,drone,x_m,y_m,z_m\n", "tracks.json": b"{}"}
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """The folder of the old archive; tests must not change it."""
-    return make_once(tmp_path_factory, "old", lambda folder: unpack(OLD, folder / "S02_D4_A")) / "S02_D4_A"
+#: The folder of the old archive; tests must not change it.
+flight = made_once("old", lambda folder: unpack(OLD, folder / "S02_D4_A"), "S02_D4_A")
 
 
 @pytest.fixture
@@ -156,23 +154,14 @@ def test_links_become_files(tmp_path):
     assert unpacked.read_bytes() == b"/"
 
 
-@pytest.mark.parametrize(
-    "name", ["../x", "a/../../x", "/x", "a//x", "./x", "..", "C:x", "a\\..\\x", "a/", "a\nx"]
-)
-def test_no_name_leads_out_of_the_folder(name, tmp_path):
-    assert_not_unpacked(crafted(tmp_path / "a.psotrack", name), "names of files inside of the folder")
-
-
-@pytest.mark.filterwarnings("ignore:Duplicate name")
-@pytest.mark.parametrize("name", ["tracks.csv", "Tracks.CSV", "psotrack.json"])
-def test_no_file_is_there_twice(name, tmp_path):
-    words = f"expected each file once, found {name} twice"
-    assert_not_unpacked(crafted(tmp_path / "a.psotrack", name), words)
-
-
 UNLIKE = "expected the files that psotrack.json lists, found a difference: "
-#: Changes of a manifest, and words of the line.
-MANIFESTS = [
+#: Names that lead out of the folder, or to no file.
+OUTSIDE = ("../x", "a/../../x", "/x", "a//x", "./x", "..", "C:x", "a\\..\\x", "a/", "a\nx")
+TWICE = ("tracks.csv", "Tracks.CSV", "psotrack.json")
+#: Name of one more file, or changes of a manifest, and words of the line.
+CRAFTED = [
+    *(({"more": name}, "names of files inside of the folder") for name in OUTSIDE),
+    *(({"more": name}, f"expected each file once, found {name} twice") for name in TWICE),
     ({"files": [*FILES, "more"]}, f"{UNLIKE}more"),
     ({"files": ["tracks.csv"]}, f"{UNLIKE}tracks.json"),
     ({"tracks": "t.csv"}, f"{UNLIKE}t.csv"),
@@ -184,8 +173,11 @@ MANIFESTS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "words"), MANIFESTS)
-def test_a_manifest_is_that_of_the_archive(changes, words, tmp_path):
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize(("changes", "words"), CRAFTED)
+def test_names_stay_in_the_folder_no_file_is_there_twice_and_a_manifest_is_that_of_the_archive(
+    changes, words, tmp_path
+):
     assert_not_unpacked(crafted(tmp_path / "a.psotrack", **changes), words)
 
 
@@ -326,16 +318,12 @@ def test_some_frames_and_some_cameras_have_the_silhouettes_of_all(flight):
 # --- what is refused
 
 
-def no_record(folder):
-    (folder / "tracks.json").unlink()
-
-
 #: What happens to a folder, and words of the line.
 UNFIT = [
     (swap_silhouettes, "other content of cam1"),
     (partial(replace_text, old="[cameras.cam8]", new="[cameras.other]"), "no camera cam8"),
     (partial(replace_text, old="fps = 25.0", new="fps = 30.0"), "10 frames at 30 Hz"),
-    (no_record, "expected the record of the tracks"),
+    (lambda folder: (folder / "tracks.json").unlink(), "expected the record of the tracks"),
     (drop_last_frame, "tracks.csv: expected 10 frames, as tracks.json says, found 9"),
 ]
 
@@ -373,13 +361,13 @@ def compare(flight, tmp_path):
     """Compare changed tracks with those of the archive."""
     manifest, tracks = read_manifest(flight), read_trajectories(flight / "tracks.csv")
 
-    def call(suffix=".csv", settings=(), versions=(), **changes):
+    def call(suffix=".csv", settings=(), versions=(), archived=flight, **changes):
         record = json.loads((flight / "tracks.json").read_text())
         record["versions"].update(versions)
         again = tmp_path / f"again{suffix}"
         write_trajectories(again, replace(tracks, **changes), force=True)
         used = manifest.track_settings().changed(dict(settings))
-        return compare_with_archive(flight, manifest, again, record, used)
+        return compare_with_archive(archived, manifest, again, record, used)
 
     return call
 
@@ -392,21 +380,12 @@ def test_the_same_tracks(compare):
     assert compare(".parquet").same
 
 
-def test_a_lost_drone_is_no_difference(flight, tmp_path):
-    archived = tmp_path / "archived"
-    shutil.copytree(flight, archived)
-    tracks = read_trajectories(archived / "tracks.csv")
-    position_m = tracks.position_m.copy()
-    position_m[4, 1] = np.nan
-    status = tracks.status.copy()
-    status[4, 1] = Status.LOST
-    lost = replace(tracks, position_m=position_m, status=status)
-    for path in (archived / "tracks.csv", tmp_path / "again.csv"):
-        write_trajectories(path, lost, force=True)
-    manifest = read_manifest(flight)
-    record = json.loads((flight / "tracks.json").read_text())
-    settings = manifest.track_settings()
-    assert compare_with_archive(archived, manifest, tmp_path / "again.csv", record, settings).same
+def test_a_lost_drone_is_no_difference(compare, own_flight):
+    tracks = read_trajectories(own_flight / "tracks.csv")
+    lost = {"position_m": tracks.position_m.copy(), "status": tracks.status.copy()}
+    lost["position_m"][4, 1], lost["status"][4, 1] = np.nan, Status.LOST
+    write_trajectories(own_flight / "tracks.csv", replace(tracks, **lost), force=True)
+    assert compare(archived=own_flight, **lost).same
 
 
 def test_other_tracks_in_words(compare, flight):
@@ -473,8 +452,7 @@ def test_tracks_are_computed_again_bit_by_bit(run_psotrack, tmp_path_factory, tm
     else:
         track += ["--init", place / "start.csv"]
     options = RUNS[name].split()
-    done = run_psotrack(*track, *options, "--particles", 15, "--iterations", 10, "--quiet")
-    assert done.code == 0, done.err
+    run_psotrack(*track, *options, "--particles", 15, "--iterations", 10, "--quiet").ended()
     assert run_psotrack(*pack).code == 0
     tracks = place.rename(tmp_path / "moved") / "tracks.csv"
 

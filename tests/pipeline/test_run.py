@@ -37,8 +37,7 @@ def test_videos_and_a_rig_file_become_a_report(run_psotrack, tmp_path):
     lab = make_sequence(tmp_path / "lab")
     for made in ("recording.toml", *(f"{name}.csv" for name in REFERENCE)):
         (lab / made).unlink()
-    done = run_psotrack("run", lab)
-    assert done.code == 0, done.err
+    done = run_psotrack("run", lab).ended()
     assert commands_in(done) == ["init", "doctor", "track", "report", "overlay"]
     assert "3 videos" in done.out
     results = lab / "results"
@@ -75,8 +74,7 @@ def test_videos_and_a_board_become_a_report(run_psotrack, tmp_path):
     lab = tmp_path / "lab"
     options = ("--as-own-cameras", "--frames", 50, "--scale", 0.5, "--out", lab, "--quiet")
     assert run_psotrack("simulate", "S02_D4_A", *options).code == 0
-    done = run_psotrack("run", lab, "--square", 0.25, "--floor", 0)
-    assert done.code == 0, done.err
+    done = run_psotrack("run", lab, "--square", 0.25, "--floor", 0).ended()
     assert "the board is a ChArUco board of 4 x 5 squares of 250 mm" in done.out
     assert commands_in(done) == ["calibrate", "init", "doctor", "track", "report", "overlay"]
     assert "drones      4" in done.out

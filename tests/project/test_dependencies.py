@@ -22,7 +22,7 @@ NOT_DECLARED = {"markupsafe", "IPython"}
 IMPORTERS = {"import_module", "_library"}
 
 
-def declared(extra: str) -> set[str]:
+def declared(extra):
     """Names of the imports that an extra, or "dependencies", declares."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     requirements = {"dependencies": project["dependencies"], **project["optional-dependencies"]}[extra]
@@ -31,9 +31,9 @@ def declared(extra: str) -> set[str]:
 
 
 @functools.cache
-def imported(folder: str) -> frozenset[str]:
+def imported(folder):
     """First parts of the names of all modules that the files below a folder import, also inside functions."""
-    found: set[str] = set()
+    found = set()
     for path in (ROOT / folder).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
@@ -49,11 +49,11 @@ def imported(folder: str) -> frozenset[str]:
 EXTRAS = ("control", "live", "view", "ros", "onnx", "dask")
 
 
-def test_what_is_declared_is_imported() -> None:
+def test_what_is_declared_is_imported():
     assert declared("dependencies") <= imported("psotrack")
     assert {extra: unused for extra in EXTRAS if (unused := declared(extra) - imported("psotrack"))} == {}
 
 
-def test_what_is_imported_is_declared() -> None:
+def test_what_is_imported_is_declared():
     known = {"psotrack", *sys.stdlib_module_names}.union(*map(declared, ("dependencies", *EXTRAS)))
     assert imported("psotrack") - known == NOT_DECLARED

@@ -98,25 +98,16 @@ def test_the_judge_sees_faults(judges, monkeypatch):
     def trace(path):
         raise ValueError("no")
 
-    def speak(path):
-        os.write(2, b"libfoo: bad\n")
-
     def forget(path):
         raise InputError("somewhere", expected="this", found="that")
-
-    def write(path):
-        (path.parent / "new").touch()
-
-    def take(path):
-        bytearray(600 << 20)
 
     judge, sound = judges("world"), FORMATS["world"]
     for read, fault in (
         (trace, "ValueError at test_fuzz.py"),
-        (speak, "stderr: libfoo: bad"),
+        (lambda path: os.write(2, b"libfoo: bad\n"), "stderr: libfoo: bad"),
         (forget, "a message without a file"),
-        (write, "a file beside the input"),
-        (take, "MiB instead of"),
+        (lambda path: (path.parent / "new").touch(), "a file beside the input"),
+        (lambda path: bytearray(600 << 20), "MiB instead of"),
     ):
         # Whoever reads the sound file without a fault, and the changed one with it.
         def both(path, read=read):

@@ -63,15 +63,11 @@ def module_name(path):
     return ".".join(part for part in path.with_suffix("").parts if part != "__init__")
 
 
-def read_order():
-    """Order of rooms, lowest first: those of the package by the table of the architecture page, then tracking's."""
-    page = ARCHITECTURE.read_text(encoding="utf-8")
-    table, _, rest = page.partition("\n## Rooms\n")[2].partition("\nInside of `tracking/`")
-    inside = re.findall(r"`(\w+)`\s\(", rest.partition("\n\n")[0])
-    return re.findall(r"^\| `(\w+)/` \|", table, re.MULTILINE), [f"tracking.{room}" for room in inside]
-
-
-ORDERS = read_order()
+_page = ARCHITECTURE.read_text(encoding="utf-8")
+_table, _, _rest = _page.partition("\n## Rooms\n")[2].partition("\nInside of `tracking/`")
+_inside = re.findall(r"`(\w+)`\s\(", _rest.partition("\n\n")[0])
+#: Order of rooms, lowest first: those of the package by the table of the architecture page, then tracking's.
+ORDERS = re.findall(r"^\| `(\w+)/` \|", _table, re.MULTILINE), [f"tracking.{room}" for room in _inside]
 
 
 @functools.cache
@@ -111,19 +107,13 @@ def place_in(order, name):
     return next((place for place, room in enumerate(order) if is_within(name, {room})), None)
 
 
-def read_exports():
-    """Room -> exported name -> module of the room that defines the name, read from the rooms' `__init__.pyi`."""
-    found = {}
-    for stub in PACKAGE.glob("*/**/__init__.pyi"):
-        room = ".".join(stub.relative_to(PACKAGE).parts[:-1])
-        found[room] = {}
-        for node in ast.parse(stub.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ImportFrom):
-                found[room] |= {alias.name: node.module for alias in node.names}
-    return found
-
-
-EXPORTS = read_exports()
+#: Room -> exported name -> module of the room that defines the name, read from the rooms' `__init__.pyi`.
+EXPORTS = {}
+for _stub in PACKAGE.glob("*/**/__init__.pyi"):
+    _own = EXPORTS[".".join(_stub.relative_to(PACKAGE).parts[:-1])] = {}
+    for _node in ast.parse(_stub.read_text(encoding="utf-8")).body:
+        if isinstance(_node, ast.ImportFrom):
+            _own |= {alias.name: _node.module for alias in _node.names}
 #: The rooms with public names, and what is at the root; a module belongs to the longest name that begins its own.
 ROOMS = {*EXPORTS, *(module_name(path).partition(".")[0] for path in SOURCES)} - {""}
 

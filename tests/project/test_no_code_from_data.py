@@ -56,7 +56,7 @@ def test_the_search_finds(text):
 class Bomb:
     """Makes a file when it is unpickled."""
 
-    def __init__(self, mark: Path) -> None:
+    def __init__(self, mark):
         self.mark = mark
 
     def __reduce__(self):

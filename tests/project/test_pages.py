@@ -8,13 +8,11 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import click
 import pytest
-from helpers import Output
 
 from psotrack.cli import cli
 from psotrack.settings import TrackSettings
@@ -33,7 +31,7 @@ CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 LINK = re.compile(r"\]\((?!\w+:)([^()\s#]+)")
 
 
-def test_every_relative_link_leads_to_a_file() -> None:
+def test_every_relative_link_leads_to_a_file():
     found = []
     for page in OUTSIDE:
         text = CODE.sub("", page.read_text(encoding="utf-8"))
@@ -42,7 +40,7 @@ def test_every_relative_link_leads_to_a_file() -> None:
     assert [path for path in found if not path.exists()] == []
 
 
-def test_nothing_links_to_an_address_of_the_package() -> None:
+def test_nothing_links_to_an_address_of_the_package():
     """Found: links to a repository, a package and pages that nobody has published."""
     command = ["git", "grep", "-nIE", "https?://[^ ]*psotrack", "--", ":!tests"]
     found = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
@@ -50,7 +48,7 @@ def test_nothing_links_to_an_address_of_the_package() -> None:
     assert (found.returncode, found.stdout) == (1, "")
 
 
-def blocks(page: Path) -> Iterator[tuple[str, str]]:
+def blocks(page):
     """Blocks of code of a page: the language, and the text; of commands, one per line and without the prompt."""
     for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
         if language == "console":
@@ -58,7 +56,7 @@ def blocks(page: Path) -> Iterator[tuple[str, str]]:
         yield language, text
 
 
-def commands(text: str) -> Iterator[list[str]]:
+def commands(text):
     """Words after `psotrack` of each command in some lines of a shell."""
     for line in text.replace("\\\n", " ").splitlines():
         if re.match(r"\s*psotrack ", line):
@@ -67,7 +65,7 @@ def commands(text: str) -> Iterator[list[str]]:
             yield words[: min(ends, default=len(words))]
 
 
-def inner_command(words: list[str]) -> tuple[click.Context, list[str]]:
+def inner_command(words):
     """The context of the command that some words name, and the words behind the name."""
     context, words = click.Context(cli, info_name="psotrack"), list(words)
     while isinstance(context.command, click.Group) and words:
@@ -83,7 +81,7 @@ def inner_command(words: list[str]) -> tuple[click.Context, list[str]]:
     return context, words
 
 
-def complaint(words: list[str]) -> str | None:
+def complaint(words):
     """What is wrong with a command: an unknown name, a value that no option takes, or something that is missing."""
     try:
         context, rest = inner_command(words)
@@ -99,14 +97,14 @@ def complaint(words: list[str]) -> str | None:
     return None
 
 
-def unknown_options(words: list[str]) -> set[str]:
+def unknown_options(words):
     """Options that the named command does not have."""
     context, rest = inner_command(words)
     known = {name for param in context.command.get_params(context) for name in param.opts}
     return {word for word in rest if word.startswith("--")} - known
 
 
-def all_commands(group: click.Group, context: click.Context) -> Iterator[click.Command]:
+def all_commands(group, context):
     yield group
     for name in group.list_commands(context):
         command = group.get_command(context, name)
@@ -114,7 +112,7 @@ def all_commands(group: click.Group, context: click.Context) -> Iterator[click.C
         yield from all_commands(command, context) if isinstance(command, click.Group) else [command]
 
 
-def test_every_command_on_a_page_and_in_a_help_is_understood() -> None:
+def test_every_command_on_a_page_and_in_a_help_is_understood():
     shells = [text for page in WRITTEN for language, text in blocks(page) if language != "python"]
     for command in all_commands(cli, click.Context(cli, info_name="psotrack")):
         shells += re.split(r"\n *Examples?:\n", command.help or "")[1:]
@@ -123,7 +121,7 @@ def test_every_command_on_a_page_and_in_a_help_is_understood() -> None:
     assert [said for said in map(complaint, found) if said] == []
 
 
-def test_every_command_within_a_sentence_has_its_name_and_its_options() -> None:
+def test_every_command_within_a_sentence_has_its_name_and_its_options():
     found = []
     for page in WRITTEN:
         text = BLOCK.sub("", page.read_text(encoding="utf-8"))
@@ -134,11 +132,11 @@ def test_every_command_within_a_sentence_has_its_name_and_its_options() -> None:
 
 
 @pytest.fixture
-def shell(tmp_path: Path) -> Callable[[str, str], str]:
+def shell(tmp_path):
     """Runs a block of a page in the folder, with a cache of its own: what it prints."""
     environment = os.environ | {"PSOTRACK_CACHE": str(tmp_path / "users_cache"), "PYTHONPATH": str(ROOT)}
 
-    def shell(language: str, text: str) -> str:
+    def shell(language, text):
         if language == "python":
             # Worker processes import the file again.
             (tmp_path / "page.py").write_text(text)
@@ -158,7 +156,7 @@ def shell(tmp_path: Path) -> Callable[[str, str], str]:
 
 
 @pytest.mark.nightly
-def test_the_newcomers_pages_run_as_they_stand(shell: Callable[[str, str], str], tmp_path: Path) -> None:
+def test_the_newcomers_pages_run_as_they_stand(shell, tmp_path):
     """From the simulated laboratory with its board to tracks, pictures, errors and Python."""
     for language, text in (block for page in NEWCOMER for block in blocks(page)):
         if language == "python":
@@ -173,9 +171,7 @@ def test_the_newcomers_pages_run_as_they_stand(shell: Callable[[str, str], str],
 
 
 @pytest.mark.nightly
-def test_the_python_of_the_readme_uses_the_silhouettes_that_track_has_stored(
-    shell: Callable[[str, str], str],
-) -> None:
+def test_the_python_of_the_readme_uses_the_silhouettes_that_track_has_stored(shell):
     section = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Python")[2]
     for language, text in BLOCK.findall(section):
         if language == "console":
@@ -187,16 +183,13 @@ def test_the_python_of_the_readme_uses_the_silhouettes_that_track_has_stored(
 
 
 @pytest.mark.slow
-def test_the_demonstration_ends_with_a_command_that_is_understood(
-    run_psotrack: Callable[..., Output], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_demonstration_ends_with_a_command_that_is_understood(run_psotrack, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("psotrack.cli.start.NUM_FRAMES", 6)
     monkeypatch.setattr("psotrack.cli.start.SCALE", 0.25)
     # For six frames, compiling the swarm would take longer than everything else.
     monkeypatch.setattr("psotrack.settings.TrackSettings", partial(TrackSettings, method="projection-lines"))
-    code, out, _ = run_psotrack("demo", "--out", "demo", "--jobs", "1")
-    assert code == 0
+    _, out, _ = run_psotrack("demo", "--out", "demo", "--jobs", "1").ended()
     words = shlex.split(out.splitlines()[-1].removeprefix("next: "))[1:]
     assert complaint(words) is None
     paths = [Path(word) for word in words if "/" in word]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from dpjait_folders import write_tum
-from helpers import assert_refused, make_once, ring_rig
+from helpers import assert_refused, made_once, make_once, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -88,37 +88,34 @@ def path_m(time_s):
     return np.stack([np.cos(1.5 * time_s), np.sin(1.5 * time_s), 1.2 + 0.2 * time_s], axis=-1)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def make_detections(folder):
     """A recording with detections of five cameras, a rig file and a reference."""
+    rig = ring_rig(5, image_size_wh=(640, 480))
+    # The last camera has twice the resolution.
+    rig.cameras.K[4, :2] *= 2
+    rig.cameras.image_size_wh[4] *= 2
+    write_rig(folder / "rig.toml", rig)
+    text = 'version = 1\ncalibration = "rig.toml"\n[reference]\nfiles = ["drone.tum"]\n'
+    for index, (name, (fps, begins_s)) in enumerate(CLOCKS.items()):
+        time_s = begins_s + np.arange(int((LASTS_S - begins_s) * fps)) / fps
+        centre_px = project(rig.cameras[index], path_m(time_s))[0] + 0.5
+        side_px = 24.0 if index == 4 else 12.0
+        xyxy = np.hstack([centre_px - side_px, centre_px + side_px])
+        found = Detections(np.arange(len(time_s)), xyxy, np.ones(len(time_s)))
+        write_detections(folder / f"{name}.csv", found)
+        text += f'[cameras.{name}]\ndetections = "{name}.csv"\nfps = {fps}\ntime_offset_s = {begins_s}\n'
+    (folder / "recording.toml").write_text(text)
+    time_s = np.arange(0, LASTS_S, 0.01)
+    write_tum(folder / "drone.tum", time_s, path_m(time_s))
 
-    def make(folder):
-        rig = ring_rig(5, image_size_wh=(640, 480))
-        # The last camera has twice the resolution.
-        rig.cameras.K[4, :2] *= 2
-        rig.cameras.image_size_wh[4] *= 2
-        write_rig(folder / "rig.toml", rig)
-        text = 'version = 1\ncalibration = "rig.toml"\n[reference]\nfiles = ["drone.tum"]\n'
-        for index, (name, (fps, begins_s)) in enumerate(CLOCKS.items()):
-            time_s = begins_s + np.arange(int((LASTS_S - begins_s) * fps)) / fps
-            centre_px = project(rig.cameras[index], path_m(time_s))[0] + 0.5
-            side_px = 24.0 if index == 4 else 12.0
-            xyxy = np.hstack([centre_px - side_px, centre_px + side_px])
-            found = Detections(np.arange(len(time_s)), xyxy, np.ones(len(time_s)))
-            write_detections(folder / f"{name}.csv", found)
-            text += f'[cameras.{name}]\ndetections = "{name}.csv"\nfps = {fps}\ntime_offset_s = {begins_s}\n'
-        (folder / "recording.toml").write_text(text)
-        time_s = np.arange(0, LASTS_S, 0.01)
-        write_tum(folder / "drone.tum", time_s, path_m(time_s))
 
-    return make_once(tmp_path_factory, "detections_alone", make)
+folder = made_once("detections_alone", make_detections)
 
 
 @pytest.mark.slow
 def test_detections_without_videos_are_tracked(run_psotrack, folder, tmp_path):
     out = tmp_path / "tracks.csv"
-    tracked = run_psotrack("track", folder, "--method", "projection-lines", "--out", out)
-    assert tracked.code == 0, tracked.err
+    run_psotrack("track", folder, "--method", "projection-lines", "--out", out).ended()
     tracks, recording = read_trajectories(out), open_recording(folder)
     assert (recording.fps, recording.num_frames) == (50.0, tracks.num_frames)
     assert tracks.num_drones == 1
@@ -156,12 +153,12 @@ WIDTH, HEIGHT, FRAMES = 96, 64, 12
 SIDE = 16
 
 
-def place(index: int) -> tuple[int, int]:
+def place(index):
     """Left and top of the moving square."""
     return 4 + 6 * index, 8 + 3 * index
 
 
-def picture(index: int) -> np.ndarray:
+def picture(index):
     """A still background with a little noise, and a square that moves."""
     noise = np.random.default_rng(index).normal(0, 1, (HEIGHT, WIDTH, 3))
     image = np.tile(np.linspace(60, 120, WIDTH), (HEIGHT, 1))[..., None] + noise
@@ -170,7 +167,7 @@ def picture(index: int) -> np.ndarray:
     return image.clip(0, 255).astype(np.uint8)
 
 
-def overlap(mask: np.ndarray, index: int) -> float:
+def overlap(mask, index):
     """Intersection over union of a mask and the square."""
     x, y = place(index)
     truth = np.zeros((HEIGHT, WIDTH), bool)
@@ -197,9 +194,7 @@ def detect(run_psotrack, tmp_path):
     """Runs `psotrack detect` with a cache of its own, and gives what it prints."""
 
     def call(*arguments):
-        result = run_psotrack("detect", *arguments, *cache_of(arguments, tmp_path))
-        assert result.code == 0, result.err
-        return result.out
+        return run_psotrack("detect", *arguments, *cache_of(arguments, tmp_path)).ended().out
 
     return call
 

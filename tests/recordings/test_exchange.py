@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
-from worlds import IMAGE_SIZE_WH, NUM_FRAMES, RATE_HZ, make_tracks, make_tracks_file, two_flights
+from worlds import IMAGE_SIZE_WH, NUM_FRAMES, RATE_HZ, make_tracks, make_tracks_file
 
 from psotrack.errors import InputError
 from psotrack.evaluation import evaluate
@@ -69,12 +69,6 @@ def small_tracks(rate_hz=RATE_HZ):
         velocity_m_s=rng.normal(0, 1, tracks.position_m.shape),
         orientation_wxyz=turn.reshape(tracks.num_frames, 2, 4),
     )
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """A recording of three equal cameras, which no test changes."""
-    return two_flights(tmp_path_factory) / "flight"
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from psotrack.recordings.mocap.marker_crosses import (
     identify_markers,
     learn_cross,
 )
-from psotrack.trajectories import Status, Trajectories, resample
+from psotrack.trajectories import Status, resample
 
 # --- C3D files of any maker
 
@@ -36,7 +36,7 @@ ORDERS = {INTEL: "<", DEC: "<", SGI: ">"}
 LABELS = ("LASI", "RASI", "SACR")
 
 
-def reals(values, processor: int) -> bytes:
+def reals(values, processor):
     """VAX has the words of a real exchanged and an exponent that is larger by 2 (except for zero)."""
     if processor == DEC:
         words = (4 * np.asarray(values, "<f4")).view("<u2")
@@ -44,7 +44,7 @@ def reals(values, processor: int) -> bytes:
     return np.asarray(values, ORDERS[processor] + "f4").tobytes()
 
 
-def value_of(value: object, processor: int) -> bytes:
+def value_of(value, processor):
     """Type, shape and content of a parameter: texts, a real, or whole numbers of 16 bits."""
     if isinstance(value, float):
         return bytes([4, 0]) + reals([value], processor)
@@ -56,16 +56,16 @@ def value_of(value: object, processor: int) -> bytes:
     return bytes([2, numbers.ndim, *numbers.shape]) + numbers.tobytes()
 
 
-def item(name: str, number: int, content: bytes, processor: int) -> bytes:
+def item(name, number, content, processor):
     """A group (of a negative number) or a parameter (of its group's number)."""
     start = struct.pack("2b", len(name), number)
     length = struct.pack(ORDERS[processor] + "H", 3 + len(content))
     return start + name.encode() + length + content + b"\0"
 
 
-def parameters(processor: int, values: dict[str, object]) -> bytes:
+def parameters(processor, values):
     """Section of parameters, which `values` names as GROUP:NAME."""
-    numbers: dict[str, int] = {}
+    numbers = {}
     items = []
     for key, value in values.items():
         group, _, name = key.partition(":")
@@ -79,16 +79,14 @@ def parameters(processor: int, values: dict[str, object]) -> bytes:
     return (start + section).ljust(512 * blocks, b"\0")
 
 
-def make_c3d(
-    path, points, *, processor=INTEL, scale=-0.1, header_frames=None, first=1, analog=0, **changed
-) -> Path:
+def make_c3d(path, points, *, processor=INTEL, scale=-0.1, header_frames=None, first=1, analog=0, **changed):
     """Write a C3D file of (frames, points, 4), of which the last value is the residual.
 
     Keywords change parameters of POINT, or of a group in GROUP__NAME; None leaves one out.
     """
     order = ORDERS[processor]
     num_frames, num_points, _ = points.shape
-    values: dict[str, object] = {
+    values = {
         "POINT:USED": num_points,
         "POINT:FRAMES": num_frames,
         "POINT:SCALE": scale,
@@ -119,7 +117,7 @@ def make_c3d(
     return path
 
 
-def make_points(num_frames: int = 20, num_points: int = 3) -> np.ndarray:
+def make_points(num_frames=20, num_points=3):
     """(frames, points, 4): whole millimetres, so that integers are exact; a point is not seen in frame 3."""
     points = np.random.default_rng(1).integers(-2000, 2000, (num_frames, num_points, 4)).astype(float)
     points[..., 3] = 0
@@ -146,7 +144,6 @@ def test_byte_orders_integers_and_reals(tmp_path, processor, scale, analog, capl
         np.testing.assert_allclose(markers.position_m[seen], independent[seen] / 1e3, rtol=1e-12)
 
 
-LONG = {"FRAMES": 65535, "LONG_FRAMES": 20.0}
 FIELDS = {"FRAMES": None, "TRIAL__ACTUAL_START_FIELD": (5, 0), "TRIAL__ACTUAL_END_FIELD": (24, 0)}
 
 
@@ -157,7 +154,7 @@ FIELDS = {"FRAMES": None, "TRIAL__ACTUAL_START_FIELD": (5, 0), "TRIAL__ACTUAL_EN
         (1149, {"FRAMES": 1149}, 20),
         (20, {"FRAMES": 12}, 12),
         (9, {"FRAMES": 0}, 9),
-        (9, LONG, 20),
+        (9, {"FRAMES": 65535, "LONG_FRAMES": 20.0}, 20),
         (9, FIELDS, 20),
     ],
 )
@@ -181,19 +178,14 @@ def test_more_frames_than_16_bits_hold(tmp_path, caplog):
 
 @pytest.mark.parametrize(
     ("unit", "metres"),
-    [("M", 1), ("METERS", 1), ("cm", 0.01), ("um", 1e-6), ("in", 0.0254), ("feet", 0.3048)],
+    [("M", 1), ("METERS", 1), ("cm", 0.01), ("um", 1e-6), ("in", 0.0254), ("feet", 0.3048), (None, 0.001)],
 )
-def test_units(tmp_path, unit, metres):
+def test_units(tmp_path, unit, metres, caplog):
     points = make_points()
-    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=(unit,)))
+    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=unit and (unit,)))
     np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] * metres, rtol=1e-6)
-
-
-def test_coordinates_without_a_unit_are_millimetres(tmp_path, caplog):
-    points = make_points()
-    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=None))
-    np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
-    assert "a.c3d: it has no POINT:UNITS; its coordinates are read as millimetres" in caplog.text
+    said = "a.c3d: it has no POINT:UNITS; its coordinates are read as millimetres"
+    assert (said in caplog.text) == (unit is None)
 
 
 def test_a_file_without_parameters_is_read_by_its_header(tmp_path, caplog):
@@ -273,7 +265,7 @@ def record_markers(markers_m, num_frames=120, begin_s=0, noise_m=0.0, rate_hz=RA
     return markers + noise_m * np.random.default_rng(begin_s).standard_normal(markers.shape)
 
 
-def make_markers(num_frames=41, drones=("Dron2", "Dron10"), rate_hz=RATE_HZ) -> Markers:
+def make_markers(num_frames=41, drones=("Dron2", "Dron10"), rate_hz=RATE_HZ):
     """Markers of drones that fly the same way one after the other, a second apart."""
     labels, position_m = [], []
     for begin_s, drone in enumerate(drones):
@@ -433,14 +425,14 @@ def turned_rad(orientation_wxyz, time_s):
 # --- bodies of a recording
 
 
-def with_markers(markers, labels, position_m) -> Markers:
+def with_markers(markers, labels, position_m):
     """The recording with more markers: positions (frames, more, 3), or one position of all frames."""
     more_m = np.broadcast_to(position_m, (len(markers.position_m), len(labels), 3))
     whole_m = np.concatenate([markers.position_m, more_m], axis=1)
     return Markers((*markers.labels, *labels), whole_m, markers.rate_hz)
 
 
-def at_frames(markers, fps=25.0, num_frames=9, offset_s=0.0) -> Trajectories:
+def at_frames(markers, fps=25.0, num_frames=9, offset_s=0.0):
     """The drones of a recording at the frames of a video."""
     frame = np.arange(num_frames)
     return resample(marker_bodies(markers, WHERE), frame, frame / fps, later_s=offset_s)
@@ -498,7 +490,7 @@ def test_any_rates_and_offsets_of_recording_and_video(rate_hz, fps, offset_s):
     np.testing.assert_allclose(truth.position_m[first:], expected_m(time_s), rtol=0, atol=atol)
 
 
-def walking(num_markers=12, num_frames=100) -> np.ndarray:
+def walking(num_markers=12, num_frames=100):
     """(frames, markers, 3): markers of a person, which swing by 5 to 25 cm relative to each other."""
     rng = np.random.default_rng(3)
     t = np.arange(num_frames)[:, None, None] / RATE_HZ
@@ -508,7 +500,7 @@ def walking(num_markers=12, num_frames=100) -> np.ndarray:
     return place_m + reach_m * np.sin(6 * t + phase) + t * [1.2, 0, 0]
 
 
-def person_and_box() -> Markers:
+def person_and_box():
     box = make_markers(100, drones=("boite",))
     return with_markers(box, [f"Anna:M{number}" for number in range(12)], walking())
 
@@ -539,15 +531,15 @@ def test_rigid_bodies_with_names_of_their_own_are_taken_with_a_line(caplog):
 # --- what is refused
 
 
-def people(position_m) -> Markers:
+def people(position_m):
     labels = tuple(f"M{number}" for number in range(position_m.shape[1]))
     return Markers(labels, position_m, RATE_HZ)
 
 
 #: A person who stands still is rigid, but larger than a drone.
 STILL_M = np.random.default_rng(0).uniform(0, [0.5, 0.4, 1.8], (12, 3))
-ONE = make_markers(drones=("cf1",))
-#: Name of the case -> markers, words of the line.
+TWO_OF_A_NAME = with_markers(make_markers(drones=("cf1",)), ["cf2:cf11"], 0.0)
+#: Name of the case -> markers, words of the line, and the label of the drone, if it is given.
 BODIES = {
     # Found: a person's C3D in a sequence's folder became drones without a word.
     "a person": (
@@ -566,20 +558,16 @@ BODIES = {
         Markers(("Dron2:1",), np.full((9, 1, 3), np.nan), RATE_HZ),
         "expected three markers of a drone in some frame, found none",
     ),
+    "the label of none": (TWO_OF_A_NAME, "body cf1, R01_D2.c3d: expected labels of cf1:cf11, cf1:c", "b9"),
+    "the label of two": (TWO_OF_A_NAME, "one marker called 'cf11', found 2", "cf11"),
 }
 
 
-@pytest.mark.parametrize(("markers", "words"), BODIES.values(), ids=BODIES)
-def test_what_is_no_drone_for_certain_is_refused(tmp_path, markers, words):
-    assert_refused(lambda: marker_bodies(markers, WHERE), f"{WHERE}", words, unchanged=tmp_path)
-
-
-def test_the_label_of_no_marker_or_of_two_is_refused(tmp_path):
-    markers = with_markers(ONE, ["cf2:cf11"], 0.0)
-    words = "body cf1, R01_D2.c3d: expected labels of cf1:cf11, cf1:cf12, "
-    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": ["b9"]}), words, unchanged=tmp_path)
-    words = "one marker called 'cf11', found 2"
-    assert_refused(lambda: marker_bodies(markers, WHERE, {"cf1": ["cf11"]}), words, unchanged=tmp_path)
+@pytest.mark.parametrize("case", BODIES)
+def test_what_is_no_drone_for_certain_is_refused(tmp_path, case):
+    markers, words, *label = BODIES[case]
+    bodies = {"cf1": label} if label else None
+    assert_refused(lambda: marker_bodies(markers, WHERE, bodies), f"{WHERE}", words, unchanged=tmp_path)
 
 
 #: Words of the line -> points, keywords of `make_c3d`.

@@ -21,7 +21,7 @@ one_camera = regular | steps
 cameras = st.lists(one_camera, min_size=1, max_size=4)
 
 
-def times_of(drawn) -> FrameTimes:
+def times_of(drawn):
     """Frame times of a drawn camera: number of frames, rate and start, or steps from time to time."""
     if isinstance(drawn, tuple):
         return FrameTimes(*drawn)
@@ -77,7 +77,6 @@ def test_corrected_times(drawn, offset_s, drift):
     assert np.allclose(corrected.time_s, times.time_s * (1 + drift) + offset_s, atol=1e-9)
 
 
-DROPPED = FrameTimes.listed(np.array([0.0, 0.1, 0.2, 0.4, 0.5]))
 #: Name of the case -> times of two cameras, rate of the instants, frames of both, offsets of the second in seconds.
 TIMELINES = {
     "a slower camera": (
@@ -87,7 +86,7 @@ TIMELINES = {
         [0, -0.025, -0.05, 0.025, 0, -0.025, -0.05, 0],
     ),
     "a dropped frame": (
-        (FrameTimes(6, 10.0), DROPPED),
+        (FrameTimes(6, 10.0), FrameTimes.listed(np.array([0.0, 0.1, 0.2, 0.4, 0.5]))),
         None,
         [[0, 0], [1, 1], [2, 2], [3, -1], [4, 3], [5, 4]],
         [0] * 6,

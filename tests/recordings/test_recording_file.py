@@ -137,10 +137,6 @@ def test_a_folder_a_file_and_a_folder_of_the_dataset_are_recordings(folder):
     np.testing.assert_array_equal(open_recording(folder).rig.cameras.K, rig.cameras.K)
 
 
-def write_times(folder, times):
-    (folder / "times.csv").write_text("frame,time_s\n" + "".join(f"{i},{t}\n" for i, t in enumerate(times)))
-
-
 TIMED = camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE)
 
 
@@ -163,7 +159,8 @@ def test_video_and_times_of_a_program_that_was_killed(folder, unfinished, num_ti
     shutil.copy(unfinished, folder)
     # Not quite regular.
     times = [index / 25 + 0.001 * (index % 2) for index in range(num_times)]
-    write_times(folder, times)
+    rows = "".join(f"{i},{t}\n" for i, t in enumerate(times))
+    (folder / "times.csv").write_text(f"frame,time_s\n{rows}")
     left = open_recording(write_recording(folder, TIMED, RIGHT)).by_name["left"]
     whole = probe(folder / "left.avi")
     # FFmpeg holds back the last 32 KiB, a few frames of this noise.
@@ -380,11 +377,6 @@ SEQUENCES = {
     "a drone twice": (copy(POSES, f"{S}/drone1_pos_25.csv"),
                       "drone1_pos_25.csv: expected one file per drone, found dron1 in ", "dron1_pos_25.csv as well"),
 }  # fmt: skip
-#: The same for the cameras on drones.
-ONBOARD = {
-    "below 0": (edit(INTRINSICS, "60.5", "-60.5"),
-                "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
-}  # fmt: skip
 
 
 def corners(old, new):
@@ -470,6 +462,11 @@ def other_names(folder):
     write_rig(folder / ANY / "rig.toml", ring_rig(2, image_size_wh=(64, 48)))
 
 
+#: A recording whose clock counts from 1970, with cameras that begin one after the other.
+SINCE_1970 = LEFT.replace("K =", "time_offset_s = 1700000000.25\nK =")
+SINCE_1970 += RIGHT.replace("K =", "time_offset_s = 1700000000.5\nK =")
+
+
 def opened(name=ANY):
     return lambda folder: open_recording(folder / name)
 
@@ -491,6 +488,10 @@ NO_RECORDINGS = {
     "a stream": (toml(f"{LEFT.replace('left.avi', 'rtsp://left/1')}size = [64, 48]\n"), usable,
                  "camera left: expected a video file, found the stream rtsp://left/1"),
     "another shape": (another_size, usable, "128 x 80 pixels as calibrated, found 64 x 48 pixels", "--size 64,48"),
+    # Refused before memory is used up.
+    "times since 1970": (toml(SINCE_1970), lambda folder: open_recording(folder / ANY).timeline(),
+        "frame times: expected at most 10000000 instants from time 0 on, found 4.3e+10: 25 Hz until 1700000000.70 s, ",
+        "when camera right ends; ", " subtract 1700000000.25 s, the time of the first frame of camera left"),
 }  # fmt: skip
 
 # --- detections, videos and pictures
@@ -536,10 +537,6 @@ def frames_of(path, fps=None):
     return lambda folder: list(read_frames(open_video(folder / path, fps)))
 
 
-def small_picture(folder):
-    cv2.imwrite(str(folder / LAST), np.zeros((32, 64), np.uint8))
-
-
 #: Name of the case -> what happens to the folder, what is called, words of the line.
 PICTURES = {
     "an ending": (nothing, writes("a.mkv"), "video: expected"),
@@ -550,7 +547,8 @@ PICTURES = {
                                 "frame: expected shape (48, 64, 3)"),
     "pictures of no rate": (nothing, frames_of("any/pictures"), "pictures: expected the rate of its pictures, "),
     "a single picture": (nothing, frames_of(LAST), "frame11.png: expected a video, or a folder of pictures"),
-    "a small picture": (small_picture, frames_of("any/pictures", 25.0),
+    "a small picture": (lambda folder: cv2.imwrite(str(folder / LAST), np.zeros((32, 64), np.uint8)),
+                        frames_of("any/pictures", 25.0),
                         "frame11.png: expected 64 x 48 pixels as in frame0.png, found 64 x 32"),
 }  # fmt: skip
 
@@ -565,28 +563,27 @@ def timeline(times, rate_hz=None):
     return lambda folder: make_timeline({"a": times}, rate_hz)
 
 
+def together(*cameras, **changes):
+    """Cameras that do not belong together, or all of a recording, are used."""
+    return lambda folder: full_hd_recording(**changes).usable(cameras or None)
+
+
+SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
+ANOTHER = "is it the video of another camera? If both show the same field of view, `psotrack calibrate convert` resc"
 #: Name of the case -> what is called, words of the line.
 FRAME_TIMES = {
     "a rate of 0": (lambda folder: FrameTimes(10, 0.0), "fps: expected a number above 0"),
     "an infinite rate": (timeline(FrameTimes(10, 25.0), np.inf), "rate: expected a number above 0"),
     "a time of NaN": (listed(0.0, np.nan, 0.1), "expected finite times, found nan s for frame 1"),
     "nothing from time 0 on": (timeline(FrameTimes(10, 25.0, -1.0)), "a camera with a frame at time 0 s or later"),
+    "no video is named": (together("a", "b", b=None), "a, b, found none for b"),
+    "smaller": (together(a={"image_size_wh": (1280, 720)}), SIZE.format("a", "1280 x 720", ANOTHER)),
+    "other sides": (together(c={"image_size_wh": (1920, 1200)}), SIZE.format("c", "1920 x 1200", ANOTHER)),
     "no frame near an instant": (
         timeline(FrameTimes.listed(np.array([0.1, 0.1078])), 25.0),
         "near one of the instants, 25 Hz from time 0 s on, found frames from 0.1 to 0.1078 s; choose another rate",
     ),
 }  # fmt: skip
-SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
-ANOTHER = "is it the video of another camera? If both show the same field of view, `psotrack calibrate convert` resc"
-#: Name of the case -> recording, arguments of `usable`, words of the line.
-USABLE = {
-    "no video is named": (full_hd_recording(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
-    "smaller": (full_hd_recording(a={"image_size_wh": (1280, 720)}), {},
-                SIZE.format("a", "1280 x 720", ANOTHER)),
-    "another shape": (full_hd_recording(c={"image_size_wh": (1920, 1200)}), {},
-                      SIZE.format("c", "1920 x 1200", ANOTHER)),
-}  # fmt: skip
-
 # --- tracks in the formats of other programs
 
 INSTANTS = Recording("any", Path("any"), cameras_of(ring_rig(1), times={"c0": FrameTimes(50, 50.0)}))
@@ -638,7 +635,6 @@ EXPORTS = {
 
 # --- what the dataset's layout cannot hold
 
-SOUND = make_camera(**UPRIGHT)
 #: Words of the line -> fields of a camera.
 LAYOUT = {
     "distortion by k1, k2, p1, p2 alone, found 5 coefficients": {"dist": (0.1, 0.0, 0.0, 0.0, 0.01)},
@@ -651,7 +647,7 @@ LAYOUT = {
 def calibration_of(fields):
     """The message names the camera that the file cannot hold, not the first one."""
     camera = make_camera(**UPRIGHT | fields)
-    rig = make_rig({"a": SOUND, "GoPro 3": camera, "z": camera})
+    rig = make_rig({"a": make_camera(**UPRIGHT), "GoPro 3": camera, "z": camera})
     return lambda folder: write_calibration(folder / "a.csv", rig)
 
 
@@ -667,6 +663,8 @@ def intrinsics(cameras):
 SKEW = {"dron1": (PLAIN_K + np.eye(3, k=1), (1920, 1080))}
 #: Name of the case -> what happens to the folder, what is called, words of the line.
 OTHERS = {
+    "a focal length below 0 on board": (edit(INTRINSICS, "60.5", "-60.5"), lambda folder: read_onboard(folder / S),
+                     "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
     "marker twice": (corners("7;", "5;"), lambda folder: read_marker_corners(folder / MARKER_CORNERS),
                      "line 3, column id: expected each marker once, found 5 again"),
     "unknown poses": (nothing, poses([[1, 1, 1], [1, np.nan, 1.0]], 2),
@@ -683,8 +681,6 @@ OTHERS = {
 BAD = NO_RECORDINGS | PICTURES | EXPORTS | OTHERS
 for name, (change, *words) in SEQUENCES.items():
     BAD[f"sequence: {name}"] = (change, opened(S), *words)
-for name, (change, *words) in ONBOARD.items():
-    BAD[f"on board: {name}"] = (change, lambda folder: read_onboard(folder / S), *words)
 for line, words in KEYS.items():
     BAD[line] = (with_line(line), opened(), *words)
 for text, words in FILES.items():
@@ -712,20 +708,3 @@ def test_it_is_refused(sound, name, capfd):
     assert_refused(lambda: call(sound), *words, unchanged=sound)
     # Libraries write nothing either.
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize("name", USABLE)
-def test_what_does_not_belong_together_is_refused(tmp_path, name):
-    recording, more, *words = USABLE[name]
-    assert_refused(lambda: recording.usable(**more), *words, unchanged=tmp_path)
-
-
-def test_times_since_1970_are_refused_before_memory_is_used_up(sound):
-    left = LEFT.replace("K =", "time_offset_s = 1700000000.25\nK =")
-    right = RIGHT.replace("K =", "time_offset_s = 1700000000.5\nK =")
-    toml(left + right)(sound)
-    words = (
-        "frame times: expected at most 10000000 instants from time 0 on, found 4.3e+10: 25 Hz until 1700000000.70 s, ",
-        "when camera right ends; ", " subtract 1700000000.25 s, the time of the first frame of camera left",
-    )  # fmt: skip
-    assert_refused(lambda: opened()(sound).timeline(), *words, unchanged=sound)

@@ -1,6 +1,5 @@
 """Videos and folders of pictures: exact frames, counts and rates, bad files, and a writer that never leaves a part."""
 
-from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,16 +24,16 @@ from psotrack.recordings import (
 WIDTH, HEIGHT = 96, 64
 
 
-def grey(level: int) -> np.ndarray:
+def grey(level):
     return np.full((HEIGHT, WIDTH, 3), level, np.uint8)
 
 
-def noise(num_frames: int) -> np.ndarray:
+def noise(num_frames):
     """Make frames of noise, which compress badly, so that a truncated file loses many frames."""
     return np.random.default_rng(0).integers(0, 255, (num_frames, HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
-def write(path: Path, frames: Iterable[np.ndarray], fps: float = 25.0) -> Path:
+def write(path, frames, fps=25.0):
     with VideoWriter(path, fps, (WIDTH, HEIGHT)) as writer:
         for frame in frames:
             writer.write(frame)
@@ -76,7 +75,7 @@ def test_a_name_that_looks_like_a_protocol(tmp_path, monkeypatch):
     assert probe(Path("cam:1 %02d.avi")).num_frames == 3
 
 
-def encoded(folder: Path, fourcc: str, num_frames: int) -> list[tuple[np.ndarray, float]]:
+def encoded(folder, fourcc, num_frames):
     """Encoded frames of a moving picture, and whether each is a key frame; the first one is."""
     kind = cv2.VideoWriter.fourcc(*fourcc)
     writer = cv2.VideoWriter(str(folder / "source.avi"), kind, 30.0, (WIDTH, HEIGHT))
@@ -88,7 +87,7 @@ def encoded(folder: Path, fourcc: str, num_frames: int) -> list[tuple[np.ndarray
     return [(source.read()[1], source.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME)) for _ in range(num_frames)]
 
 
-def packed(path: Path, frames: list[tuple[np.ndarray, float]], ticks: Iterable[int], fourcc: str) -> Path:
+def packed(path, frames, ticks, fourcc):
     """A video of encoded frames at whole numbers of intervals of 1 / 30 s."""
     raw = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1]
     writer = cv2.VideoWriter(
@@ -102,7 +101,7 @@ def packed(path: Path, frames: list[tuple[np.ndarray, float]], ticks: Iterable[i
     return path
 
 
-def with_hidden(path: Path, num_frames: int) -> Path:
+def with_hidden(path, num_frames):
     """An MP4 whose first frames are hidden, as `ffmpeg -c copy` cuts: its edit list begins in the middle."""
     content = bytearray(path.read_bytes())
     place = content.index(b"elst") + 16
@@ -116,7 +115,7 @@ def with_hidden(path: Path, num_frames: int) -> Path:
 DROPPED = [*range(15), *range(24, 60)]
 
 
-def mp4(folder: Path, ticks: Sequence[int], fourcc: str = "MJPG") -> Path:
+def mp4(folder, ticks, fourcc="MJPG"):
     return packed(folder / "a.mp4", encoded(folder, "MJPG", len(ticks)), ticks, fourcc)
 
 
@@ -253,7 +252,7 @@ def test_a_full_disk_is_an_error_and_keeps_the_old_file(tmp_path, capfd, missing
 # --- joining
 
 
-def key_frames(path: Path) -> list[bool]:
+def key_frames(path):
     """Whether the index of the container (chunk `idx1`) marks each frame as a key frame."""
     data = path.read_bytes()
     start = data.rfind(b"idx1")
@@ -262,7 +261,7 @@ def key_frames(path: Path) -> list[bool]:
     return (entries.reshape(-1, 4)[:, 1] & 0x10 > 0).tolist()
 
 
-def moving_picture(num_frames: int, start: int = 0) -> list[np.ndarray]:
+def moving_picture(num_frames, start=0):
     """Make frames of a moving picture; no two of its frames are equal."""
     noise = np.random.default_rng(1).integers(0, 255, (HEIGHT, 400, 3), np.uint8)
     large = cv2.GaussianBlur(noise, (0, 0), 2)

@@ -4,10 +4,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from helpers import assert_refused, cameras_of, ring_rig
+from helpers import assert_refused, cameras_of, opencv_pixels, ring_rig, sphere_points
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
@@ -40,24 +39,15 @@ def tracks_with(*changes):
     return replace(make_tracks(), status=status)
 
 
-def recording_of(rig, **fields) -> Recording:
+def recording_of(rig, **fields):
     times = dict.fromkeys(rig.names, FrameTimes(NUM_FRAMES, RATE_HZ)) | fields.pop("times", {})
     return Recording("lab", Path("lab"), cameras_of(rig, times=times, **fields))
 
 
-def flight_with(record, recording=None) -> TrackedFlight:
+def flight_with(record, recording=None):
     """Tracks with a record."""
     (tracks,) = flight_of(tracks_with()).tracks
     return TrackedFlight("lab", (replace(tracks, record=as_run_record(record, "tracks")),), recording)
-
-
-def pixels_by_opencv(camera, points_m):
-    """(points, 2), pixels by OpenCV's own projection, as an oracle."""
-    rotation, _ = cv2.Rodrigues(camera.T_cam_world[:3, :3])
-    t_m, dist = camera.T_cam_world[:3, 3], np.array(camera.dist)
-    points_m = np.ascontiguousarray(points_m)
-    pixels, _ = cv2.projectPoints(points_m, rotation, t_m, camera.K, dist)
-    return pixels[:, 0]
 
 
 @pytest.mark.parametrize(
@@ -77,23 +67,22 @@ def test_boxes_and_ellipses_are_about_the_drones_at_the_exposure(camera, offset_
     views = view_in_images(recording, tracks, SIZE_M)
     assert (views.frame[:, camera] == np.arange(NUM_FRAMES)).all()
     assert views.boxes_px.shape == (NUM_FRAMES, 2, 3, 4)
-    direction = np.random.default_rng(0).normal(size=(4000, 3))
-    sphere = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    sphere = sphere_points(4000)
     for drone in range(2):
         # Rows are exposed one after the other from the frame's time on. During the exposure of the drone, the row
         # itself moves by less than two rows, 1 mm of flight, 0.1 pixels.
         place_m = position_m[number, drone]
-        ((_, row_px),) = pixels_by_opencv(seen_by, place_m[None])
+        ((_, row_px),) = opencv_pixels(seen_by, place_m[None])
         exposed_s = offset_s + line_time_s * (row_px + 0.5)
         at_m = place_m + exposed_s * velocity_m_s[0, 0]
-        pixels = pixels_by_opencv(seen_by, at_m + sphere * SIZE_M[drone] / 2) + 0.5
+        pixels = opencv_pixels(seen_by, at_m + sphere * SIZE_M[drone] / 2) + 0.5
         expected = [*pixels.min(axis=0), *pixels.max(axis=0)]
-        # 4,000 random points miss the outermost point of the surface by less than a fifth of a pixel.
+        # 4,000 points miss the outermost point of the surface by less than a fifth of a pixel.
         np.testing.assert_allclose(views.boxes_px[number, drone, camera], expected, atol=0.2)
 
         variance_m2 = np.diag(tracks.covariance_m2[number, drone])
         half_m = np.sqrt(variance_m2 * chi2.ppf(0.9, 3))
-        off = pixels_by_opencv(seen_by, at_m + sphere * half_m)
+        off = opencv_pixels(seen_by, at_m + sphere * half_m)
         off -= views.middle_px[number, drone, camera]
         shape_px2 = views.shape_px2[number, drone, camera]
         radius2 = (off @ np.linalg.inv(shape_px2) * off).sum(axis=1)
@@ -219,7 +208,7 @@ def test_exported_tracks_beside_a_file_are_no_record(tmp_path):
 
 # --- what is refused
 
-#: Name of a file of tracks that `place` makes -> the record beside it.
+#: Name of a file of tracks -> the record beside it.
 RECORDS = {"other_types": '{"encounters": 3}', "of_a_barn": '{"sequence": "barn"}'}
 #: Command -> words of the line.
 BAD = {
@@ -241,9 +230,9 @@ BAD = {
 }
 
 
-@pytest.fixture
-def place(tmp_path, monkeypatch, world):
-    """The current folder, with files of tracks."""
+@pytest.mark.parametrize("command", BAD)
+def test_wrong_input_is_one_line(run_psotrack, world, tmp_path, monkeypatch, command):
+    """In a folder with files of tracks, without a screen."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.chdir(tmp_path)
@@ -254,10 +243,5 @@ def place(tmp_path, monkeypatch, world):
     write_trajectories("longer.csv", replace(tracks, time_s=10 * tracks.time_s))
     Path("longer.json").write_text("{}", encoding="utf-8")
     write_trajectories("late.csv", replace(tracks, time_s=tracks.time_s + 100))
-    return tmp_path
-
-
-@pytest.mark.parametrize("command", BAD)
-def test_wrong_input_is_one_line(run_psotrack, world, place, command):
     words = command.format(tracks=world / "tracks.csv", flight=world / "flight").split()
-    assert_refused(lambda: run_psotrack(*words), *BAD[command], unchanged=place)
+    assert_refused(lambda: run_psotrack(*words), *BAD[command], unchanged=tmp_path)

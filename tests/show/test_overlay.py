@@ -1,7 +1,5 @@
 """`psotrack overlay`: what is drawn where, numbers of frames, interrupted runs, and codecs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 
@@ -33,19 +31,6 @@ def off_colour(image, box_px, colour):
     return np.abs(near - colour).mean(axis=2).min()
 
 
-@pytest.fixture
-def run(run_psotrack, world, tmp_path):
-    """Runs `psotrack overlay` with some options for the flight, whose videos are in `videos`: what it prints."""
-
-    def run(*options):
-        words = (world / "tracks.csv", world / "flight", "--out", tmp_path / "videos", "--jobs", 1, *options)
-        done = run_psotrack("overlay", *words)
-        assert (done.code, done.err) == (0, "")
-        return done.out
-
-    return run
-
-
 #: Options -> size of an image per size of its camera, and the corner of each camera's image in its video.
 LAYOUTS = {
     (): (1.0, [(0, 0)] * 3),
@@ -56,11 +41,13 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("options", LAYOUTS)
-def test_boxes_are_drawn_where_the_drones_are(run, flight, tmp_path, options):
+def test_boxes_are_drawn_where_the_drones_are(run_psotrack, world, flight, tmp_path, options):
     scale, corners = LAYOUTS[options]
-    out, is_mosaic = run(*options), options == ("--mosaic",)
+    words = (world / "tracks.csv", world / "flight", "--out", tmp_path / "videos", "--jobs", 1, *options)
+    done, is_mosaic = run_psotrack("overlay", *words), options == ("--mosaic",)
     names = ["mosaic"] * 3 if is_mosaic else CAMERAS
-    assert f"{len(set(names))} videos in " in out
+    assert (done.code, done.err) == (0, "")
+    assert f"{len(set(names))} videos in " in done.out
     files = {path.name for path in (tmp_path / "videos").iterdir()}
     assert files == {"overlay.json", *(f"{name}.mp4" for name in names)}
     width, height = (round(scale * side) for side in IMAGE_SIZE_WH)

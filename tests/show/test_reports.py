@@ -232,7 +232,7 @@ def rows_of(shown):
     return [[cell.text for cell in row] for row in page.iter("tr")]
 
 
-def tracks() -> Trajectories:
+def tracks():
     """Two drones over 4 s: one flies 1 m/s along x; the other, at rest, comes late, coasts, is lost and comes back."""
     frame = np.arange(5)
     position_m = np.zeros((5, 2, 3), np.float32)

@@ -1,7 +1,5 @@
 """`psotrack view`: what is in its files by Rerun's own reader, in a browser and live, and what the machine lacks."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -14,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import rerun as rr
-from helpers import Output, assert_refused, drawn_silhouettes, listening_at
+from helpers import AT_A_TERMINAL, Output, assert_refused, drawn_silhouettes, listening_at
 from rerun.chunk import RrdReader
 from worlds import CAMERAS, COASTING, IMAGE_SIZE_WH, LOST_FROM, NUM_FRAMES, REFERENCE, make_tracks
 
@@ -181,8 +179,7 @@ def test_cameras_stand_where_the_rig_says(saved, flight):
 
 def test_the_first_frames_of_some_cameras_and_what_the_file_has_is_said(run, world, tmp_path):
     arguments = (world / "tracks.csv", world / "flight", "--frames", 5, "--cameras", "c0,c2")
-    code, out, _ = run(*arguments, "--save", tmp_path / "part.rrd")
-    assert code == 0
+    _, out, _ = run(*arguments, "--save", tmp_path / "part.rrd").ended()
     assert "10 images (every frame, full size)" in out
     assert "--silhouettes computes them" in out
     assert not (tmp_path / "cache").exists()
@@ -256,19 +253,10 @@ def test_a_full_disk_is_one_line(start_python, world, tmp_path):
     assert_refused(view, "x.rrd", "the whole file", "disk", unchanged=tmp_path)
 
 
-#: The program with Ctrl-C as at a terminal: a shell starts programs in the background with Ctrl-C ignored.
-HEARS_CTRL_C = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from psotrack.__main__ import main
-main()
-"""
-
-
 @pytest.mark.slow
 def test_the_page_for_a_browser(start_python, world):
     """The page is served to this computer only, and Ctrl-C ends the command and its server."""
-    process = start_python("-c", HEARS_CTRL_C, "view", world / "tracks.csv", "--web")
+    process = start_python("-c", AT_A_TERMINAL, "view", world / "tracks.csv", "--web")
     page = next(line.split()[0] for line in process.stdout if line.startswith("http://"))
     assert page.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(page, timeout=60) as answer:

@@ -12,7 +12,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from helpers import assert_refused, content_of, make_once, read_mocap_markers
+from helpers import assert_refused, content_of, made_once, read_mocap_markers
 from placed_drones import S02, number_image, opencv_pixels
 from scipy.spatial.transform import Rotation
 
@@ -63,16 +63,14 @@ def scene():
     return build(PAIR, scale=TINY.scale)
 
 
-@pytest.fixture(scope="module")
-def pair_folder(tmp_path_factory):
-    """Folder of an uninterrupted simulation, to which interrupted simulations are compared."""
+def make_pair(folder):
+    """An uninterrupted simulation, to which interrupted simulations are compared."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generate, "SEGMENT_FRAMES", 2)
+        simulate(PAIR, folder, TINY, jobs=1)
 
-    def make(folder):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(generate, "SEGMENT_FRAMES", 2)
-            simulate(PAIR, folder, TINY, jobs=1)
 
-    return make_once(tmp_path_factory, "pair_sequence", make) / "Simulated_Data" / NAME
+pair_folder = made_once("pair_sequence", make_pair, f"Simulated_Data/{NAME}")
 
 
 @pytest.fixture
@@ -376,8 +374,7 @@ def test_neighbours_see_the_board_together_and_it_is_tilted():
 def test_the_folder_of_a_laboratory(tmp_path, run_psotrack):
     folder = tmp_path / "lab"
     small = ("--scale", 0.1, "--frames", 6, "--jobs", 1, "-q")
-    result = run_psotrack("simulate", "S01_D2_A", "--as-own-cameras", "--out", folder, *small)
-    assert result.code == 0, result.err
+    run_psotrack("simulate", "S01_D2_A", "--as-own-cameras", "--out", folder, *small).ended()
     for camera in OWN_CAMERAS:
         flight = probe(folder / camera.flight)
         calibration = probe(folder / "board" / f"{camera.name}.avi")

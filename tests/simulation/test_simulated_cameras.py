@@ -9,7 +9,8 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from helpers import project_points
+from helpers import opencv_pixels as projected_by_opencv
+from helpers import posed, project_points, simple_lens
 from placed_drones import (
     BLACK,
     CORNERS_M,
@@ -33,7 +34,7 @@ from placed_drones import (
 )
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import look_at, make_camera, make_rig, project, undistort
+from psotrack.geometry import make_rig, project, undistort
 from psotrack.inside_out import choose_lens
 from psotrack.recordings.datasets import onboard_pose_file, open_recording, read_poses, write_poses
 from psotrack.simulation import CameraRenderer, SimulationSettings, build, change_scenario, simulate
@@ -136,19 +137,16 @@ LENSES = {
 def with_lens(name):
     """A scene without blur, motion and shadows, with one camera in the middle of the room that has a lens."""
     focal_px, dist, fisheye = LENSES[name]
-    R, t_m = look_at((0.3, -1.5, 1.6), (0.0, 3.0, 1.3))
     K = np.array([[focal_px, 3.0, 236.0], [0.0, 1.02 * focal_px, 137.0], [0.0, 0.0, 1.0]])
-    lens = make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye)
-    return replace(with_imaging(laboratory(), PLAIN), rig=make_rig({"cam1": lens}))
+    lens = replace(simple_lens(focal_px, SIZE_WH, dist, fisheye=fisheye), K=K)
+    rig = make_rig({"cam1": posed(lens, (0.3, -1.5, 1.6), (0.0, 3.0, 1.3))})
+    return replace(with_imaging(laboratory(), PLAIN), rig=rig)
 
 
 def lens_pixels(lens, points_m):
     """Pixels of points by OpenCV, which has no skew: the skew is added to normalised coordinates."""
-    function = cv2.projectPoints if lens.fisheye is None else cv2.fisheye.projectPoints
-    T = lens.T_cam_world
-    turn, _ = cv2.Rodrigues(T[:3, :3])
-    flat, _ = function(points_m.reshape(-1, 1, 3), turn, T[:3, 3], np.eye(3), lens.dist)
-    return flat[:, 0] @ lens.K[:2, :2].T + lens.K[:2, 2]
+    flat = projected_by_opencv(replace(lens, K=np.eye(3)), points_m)
+    return flat @ lens.K[:2, :2].T + lens.K[:2, 2]
 
 
 @pytest.mark.parametrize("name", LENSES)

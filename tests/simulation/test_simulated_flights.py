@@ -62,12 +62,6 @@ FLIGHT_KINDS = [type(record).__name__ for record in FLIGHTS_OF_EVERY_KIND]
 WAYPOINTS = FLIGHTS_OF_EVERY_KIND[FLIGHT_KINDS.index("Waypoints")]
 
 
-@pytest.fixture(scope="module")
-def planned_flights():
-    flights = plan(make_scenario(*FLIGHTS_OF_EVERY_KIND, variation=Variation()), 3)
-    return dict(zip(FLIGHT_KINDS, flights, strict=True))
-
-
 def positions(recipe, seed, stride=1):
     time_s = frame_times_s(recipe, recipe.num_frames)[::stride]
     return np.stack([flight.position_m(time_s) for flight in plan(recipe, seed)])
@@ -91,8 +85,9 @@ def derivatives(flight):
 
 
 @pytest.mark.parametrize("flight_kind", FLIGHT_KINDS)
-def test_attitude_follows_the_thrust_and_derivatives_the_position(planned_flights, flight_kind):
-    flight = planned_flights[flight_kind]
+def test_attitude_follows_the_thrust_and_derivatives_the_position(flight_kind):
+    flights = plan(make_scenario(*FLIGHTS_OF_EVERY_KIND, variation=Variation()), 3)
+    flight = flights[FLIGHT_KINDS.index(flight_kind)]
     # The first difference errs by at most h^2 / 6 times the third derivative. The second difference of waypoints errs
     # by h times the step of their third derivative, 60 d / T^3 with d = 1.7 m and T = 1.9 s: 15 m/s^3.
     atol = 2e-2 if flight_kind == "Waypoints" else 2e-4

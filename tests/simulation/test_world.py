@@ -22,11 +22,6 @@ from psotrack.simulation.world.rooms import HALLS
 MODELS = {name: drones.model(name) for name in drones.MODELS}
 
 
-def as_trimesh(triangles):
-    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    return trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=True)
-
-
 def distances_m(points_m):
     """Distances of all pairs of points, in ascending order, metres."""
     return np.sort([np.linalg.norm(a - b) for a, b in itertools.combinations(points_m, 2)])
@@ -51,7 +46,9 @@ def test_a_model_is_closed_and_has_its_stated_sizes(name):
     assert list(drones.MODELS) == list(SIZES)
     model = MODELS[name]
     rotors, motor_to_motor_m, over_all_m, volume_cm3 = SIZES[name]
-    parts = as_trimesh(model.triangles_m).split(only_watertight=False)
+    corners_m = model.triangles_m.reshape(-1, 3)
+    faces = np.arange(len(corners_m)).reshape(-1, 3)
+    parts = trimesh.Trimesh(corners_m, faces, process=True).split(only_watertight=False)
     assert len(parts) > 10
     for part in parts:
         assert part.is_watertight

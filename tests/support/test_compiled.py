@@ -3,12 +3,10 @@
 import os
 import threading
 import time
-from pathlib import Path
 
 import jax
 import pytest
 from helpers import environment_without_jax_settings
-from worlds import two_flights
 
 from psotrack.support import compiled, drop_programs_if_many, keep_compiled, measured_compiling
 
@@ -77,7 +75,7 @@ def test_a_program_is_compiled_once_and_a_damaged_entry_is_named_and_replaced(st
     assert without == (f"{RESULT}\n", "")
 
 
-def test_a_users_own_cache_folder_is_kept(tmp_path: Path) -> None:
+def test_a_users_own_cache_folder_is_kept(tmp_path):
     """Here it is the suite's folder, which an environment variable names."""
     own = jax.config.jax_compilation_cache_dir
     keep_compiled(tmp_path / "default")
@@ -102,11 +100,11 @@ def test_programs_are_dropped_when_the_process_has_many_memory_maps(monkeypatch,
     assert not drop_programs_if_many(most_maps=0)
 
 
-def test_threads_that_compile_at_the_same_time_count_once() -> None:
+def test_threads_that_compile_at_the_same_time_count_once():
     tracing_s = 0.2
 
-    def compile_something() -> None:
-        def slow_to_trace(x: jax.Array) -> jax.Array:
+    def compile_something():
+        def slow_to_trace(x):
             time.sleep(tracing_s)
             return x + 1
 
@@ -130,12 +128,11 @@ def test_threads_that_compile_at_the_same_time_count_once() -> None:
 
 
 @pytest.mark.slow
-def test_settings_of_jax_for_other_programs_change_no_result(start_python, tmp_path_factory, tmp_path):
+def test_settings_of_jax_for_other_programs_change_no_result(start_python, flight, tmp_path):
     """Neither of both trackers together, of smoothing and clocks, of tracking step by step, nor of drawn boxes."""
-    flight = two_flights(tmp_path_factory) / "flight"
     swarm = "--particles 8 --iterations 4 --drone-size 0.4,0.4,0.2"
 
-    def done(name: str, **variables: str) -> tuple[int, str, Path]:
+    def done(name, **variables):
         folder = tmp_path / name
         words = [
             f"track {flight} --out {folder}/fused.csv --method fused --detections blobs --smooth --clocks auto {swarm}",

@@ -1,7 +1,5 @@
 """Progress where there is no terminal: lines now and then, and one tidy output per stage in a notebook."""
 
-from __future__ import annotations
-
 import io
 import sys
 
@@ -15,9 +13,9 @@ from psotrack.pipeline import speed_in_words
 from psotrack.support import joined, no_progress, progress_bar, progress_lines, terminal_bar
 
 
-def lines_of(steps: list[tuple[float, int]], total: int, long_s: float = 0.0) -> list[str]:
+def lines_of(steps, total, long_s=0.0):
     """Lines about a stage whose steps take some seconds each."""
-    written: list[str] = []
+    written = []
     now_s = 0.0
     with progress_lines(written.append, long_s=long_s, clock=lambda: now_s)("track", total) as advance:
         for seconds, count in steps:
@@ -26,7 +24,7 @@ def lines_of(steps: list[tuple[float, int]], total: int, long_s: float = 0.0) ->
     return written
 
 
-def test_lines_of_a_stage_of_two_minutes() -> None:
+def test_lines_of_a_stage_of_two_minutes():
     assert lines_of([(1.0, 5)] * 120, 600) == [
         "track: 100 of 600 (17%), 20 s",
         "track: 200 of 600 (33%), 40 s, about 80 s left",
@@ -37,7 +35,7 @@ def test_lines_of_a_stage_of_two_minutes() -> None:
     ]
 
 
-def test_the_rest_is_not_as_slow_as_a_step_that_waited_for_a_compilation() -> None:
+def test_the_rest_is_not_as_slow_as_a_step_that_waited_for_a_compilation():
     """Found: "about 13 h 57 min left", and the end a minute later."""
     assert lines_of([(80.0, 25)] + [(1.0, 1)] * 50, 75) == [
         "track: 25 of 75 (33%), 80 s",
@@ -48,7 +46,7 @@ def test_the_rest_is_not_as_slow_as_a_step_that_waited_for_a_compilation() -> No
 
 
 @given(seconds=st.lists(st.floats(0, 50), min_size=1, max_size=60), long_s=st.sampled_from([0.0, 20.0]))
-def test_few_lines_and_none_about_short_stages(seconds: list[float], long_s: float) -> None:
+def test_few_lines_and_none_about_short_stages(seconds, long_s):
     lines = lines_of([(each, 1) for each in seconds], len(seconds), long_s)
     if sum(seconds) < long_s:
         assert lines == []
@@ -58,11 +56,11 @@ def test_few_lines_and_none_about_short_stages(seconds: list[float], long_s: flo
         assert lines[-1].startswith(f"track: {len(seconds)} of {len(seconds)} in ")
 
 
-def test_a_stage_that_an_error_ends_says_so_and_joined_reports_count_the_same_steps() -> None:
-    written: tuple[list[str], list[str]] = [], []
+def test_a_stage_that_an_error_ends_says_so_and_joined_reports_count_the_same_steps():
+    written = [], []
     report = joined(*(progress_lines(each.append, clock=lambda: 0.0) for each in written), no_progress)
 
-    def work() -> None:
+    def work():
         with report("track", 10) as advance:
             advance(1)
             advance(3)
@@ -73,9 +71,7 @@ def test_a_stage_that_an_error_ends_says_so_and_joined_reports_count_the_same_st
     assert written == (["track: 4 of 10, stopped after 0.0 s"],) * 2
 
 
-def test_lines_go_to_stderr_and_short_work_is_quiet(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lines_go_to_stderr_and_short_work_is_quiet(capfd, monkeypatch):
     for report in (no_progress, progress_bar):
         with report("track", 2) as advance:
             advance(2)
@@ -91,7 +87,7 @@ def test_lines_go_to_stderr_and_short_work_is_quiet(
     assert "7/7" in stream.getvalue()
 
 
-def test_a_speed_in_words() -> None:
+def test_a_speed_in_words():
     assert speed_in_words(0.0077) == "130 times slower than the video"
     assert speed_in_words(0.99) == "as fast as the video"
 
@@ -99,7 +95,7 @@ def test_a_speed_in_words() -> None:
 @pytest.mark.nightly
 # The kernel of Jupyter leaves sockets to the garbage collector.
 @pytest.mark.filterwarnings("ignore")
-def test_a_saved_notebook_has_one_output_per_stage() -> None:
+def test_a_saved_notebook_has_one_output_per_stage():
     source = """
 import time
 from psotrack.support import progress_bar

@@ -8,10 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
-from helpers import assert_refused, listening_at
+from helpers import AT_A_TERMINAL, assert_refused, listening_at
 from small_sweeps import all_rows, environment, grid_file, small_sequence, wait_until
 
 from psotrack.sweeps import Cluster, Inputs, Store, read_grid, runner
@@ -33,18 +32,14 @@ def die_once(event, arguments):
 
 sys.addaudithook(die_once)
 """
-#: `psotrack` as at a terminal: shells start programs in the background with Ctrl-C ignored.
-AT_A_TERMINAL = """
-import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)
-from psotrack.__main__ import main
-main()
-"""
+
+
+root = small_sequence
 
 
 @pytest.mark.slow
-def test_a_worker_is_killed_and_its_cell_runs_again(start_python, run_psotrack, tmp_path_factory, tmp_path):
-    root, results, died = small_sequence(tmp_path_factory), tmp_path / "results", tmp_path / "died"
+def test_a_worker_is_killed_and_its_cell_runs_again(start_python, run_psotrack, root, tmp_path):
+    results, died = tmp_path / "results", tmp_path / "died"
     dying = tmp_path / "dying.py"
     dying.write_text(DYING)
     more = {
@@ -76,9 +71,9 @@ def test_without_dask_one_line_says_what_to_install(monkeypatch, tmp_path):
 
 @pytest.mark.nightly
 def test_a_local_cluster_listens_on_the_loopback_only_and_ctrl_c_ends_it_with_one_line(
-    start_python, tmp_path_factory, tmp_path
+    start_python, root, tmp_path
 ):
-    root, results = small_sequence(tmp_path_factory), tmp_path / "results"
+    results = tmp_path / "results"
     # A cell of minutes, so that Ctrl-C comes while a worker computes.
     grid = grid_file(tmp_path, [100_000], runs=100)
     words = ("sweep", grid, "--data", root, "--out", results, "--cluster", "local", "--workers", 2)
@@ -124,7 +119,7 @@ def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
     assert all(line.startswith(f"--cluster {address}: ") for line in lines)
 
 
-def _certificates(folder: Path) -> dict[str, str]:
+def _certificates(folder):
     """A certificate that signs itself, and Dask's settings with it."""
     command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=test"]
     key, certificate = folder / "key.pem", folder / "certificate.pem"
@@ -137,9 +132,9 @@ def _certificates(folder: Path) -> dict[str, str]:
 
 @pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
-def test_a_sweep_on_a_cluster_with_tls(start_python, run_psotrack, tmp_path_factory, tmp_path):
+def test_a_sweep_on_a_cluster_with_tls(start_python, run_psotrack, root, tmp_path):
     """The commands of the page about clusters: a scheduler and a worker with TLS, and a sweep."""
-    root, tls = small_sequence(tmp_path_factory), _certificates(tmp_path)
+    tls = _certificates(tmp_path)
     file = tmp_path / "scheduler.json"
     listening = ["--protocol", "tls", "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file]
     start = functools.partial(start_python, "-m", env=environment(root) | tls)
@@ -153,9 +148,7 @@ def test_a_sweep_on_a_cluster_with_tls(start_python, run_psotrack, tmp_path_fact
     # What Dask reads in the variables when it is imported.
     names = [name.removeprefix("DASK_").lower().replace("__", ".") for name in tls]
     with dask.config.set(dict(zip(names, tls.values(), strict=True))):
-        done = run_psotrack(*words, "--out", tmp_path / "results")
-    assert done.code == 0, done.err
+        done = run_psotrack(*words, "--out", tmp_path / "results").ended()
     assert json.loads(done.out) == {"finished": 1, "failed": 0, "left": 0}
-    stranger = run_psotrack(*words, "--out", tmp_path / "other")
-    assert stranger.code == 2
+    stranger = run_psotrack(*words, "--out", tmp_path / "other").ended(2)
     assert stranger.err.startswith("psotrack: --cluster: expected a Dask scheduler")

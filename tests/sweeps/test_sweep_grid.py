@@ -214,7 +214,6 @@ def test_what_decides_the_rows_is_in_the_key_alone():
 
 FRAMES, REDUCTION = 70, 4
 EVERYTHING = Perturbation(extrinsics_deg=0.3, clock_frames=1.5, flipped=0.05)
-ANOTHER_DRAW = msgspec.structs.replace(EVERYTHING, draw=1)
 
 
 def flown(num_cameras=5, frames=None):
@@ -247,7 +246,7 @@ def test_random_numbers_depend_on_the_draw_alone():
     untouched, _ = flown()
     np.testing.assert_array_equal(flight[0].rig.cameras.T_cam_world, untouched.rig.cameras.T_cam_world)
     np.testing.assert_array_equal(frames_of(flight[1]), frames_of(flown()[1]))
-    other_poses, other_frames = perturbed(ANOTHER_DRAW)
+    other_poses, other_frames = perturbed(msgspec.structs.replace(EVERYTHING, draw=1))
     assert not np.allclose(other_poses, poses)
     assert (other_frames != frames).any()
     turned_alone, _ = perturbed(Perturbation(extrinsics_deg=0.3))

@@ -13,7 +13,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -24,7 +23,7 @@ from small_sweeps import SETTINGS, all_rows, grid_file, small_sequence, stamps
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
 from psotrack.support import Locks, register_plugin
-from psotrack.sweeps import Inputs, Store, SweepOutcome, cell_key, inputs, plan, runner, sweep
+from psotrack.sweeps import Inputs, Store, cell_key, inputs, plan, runner, sweep
 from psotrack.sweeps import grid as grid_of
 
 METHODS = """
@@ -34,20 +33,18 @@ swarm.inertia = 0.4
 """
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data folder with a small sequence, and a cache."""
-    return small_sequence(tmp_path_factory)
+#: A data folder with a small sequence, and a cache.
+root = small_sequence
 
 
 @pytest.fixture
-def run(root: Path, tmp_path: Path):
+def run(root, tmp_path):
     """Sweeps the small sequence into a folder of the test."""
     return partial(sweep, out=tmp_path / "out", data=root, cache=root / "cache", jobs=1)
 
 
 @pytest.fixture(scope="module")
-def swept(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def swept(root, tmp_path_factory):
     """A folder with grids and results of four cells that finish and four cells that fail."""
     folder = tmp_path_factory.mktemp("sweep")
     whole = grid_file(folder, [3, 6], runs=2)
@@ -63,12 +60,12 @@ def swept(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Tracker:
     """Replaces the tracker: finds no drones, and fails for some numbers of iterations."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.runs: list[tuple[int, list[int]]] = []
-        self.failing: set[int] = set()
+    def __init__(self, monkeypatch):
+        self.runs = []
+        self.failing = set()
         monkeypatch.setattr(runner, "track_runs", self)
 
-    def __call__(self, sequence: object, silhouettes: object, settings: list) -> list[InputError]:
+    def __call__(self, sequence, silhouettes, settings):
         iterations = settings[0].swarm.iterations
         if iterations in self.failing:
             raise ZeroDivisionError("planted")
@@ -77,16 +74,16 @@ class Tracker:
 
 
 @pytest.fixture
-def tracker(monkeypatch: pytest.MonkeyPatch) -> Tracker:
+def tracker(monkeypatch):
     return Tracker(monkeypatch)
 
 
-def varied(*iterations: int, runs: int = 1, **settings: object) -> dict:
+def varied(*iterations, runs=1, **settings):
     grid = {"swarm.iterations": list(iterations)}
     return {"sequences": ["S01_D2_A"], "runs": runs, "settings": SETTINGS | settings, "grid": grid}
 
 
-def seeds_of(outcome: SweepOutcome) -> list[list[int]]:
+def seeds_of(outcome):
     """Iterations and seed of each row."""
     rows = outcome.rows()
     return rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist()
@@ -96,7 +93,7 @@ def seeds_of(outcome: SweepOutcome) -> list[list[int]]:
 class TestTracked:
     """Cells that are tracked."""
 
-    def test_one_row_per_cell_and_run(self, swept: Path) -> None:
+    def test_one_row_per_cell_and_run(self, swept):
         order = ["method", "settings.swarm.iterations", "seed"]
         rows = all_rows(swept / "results").sort_values(order, ignore_index=True)
         found = rows[order].itertuples(index=False, name=None)
@@ -118,18 +115,16 @@ class TestTracked:
         pd.testing.assert_frame_equal(data_set, Store(swept / "results").rows(), check_dtype=False)
 
     def test_the_command_runs_no_finished_cell_again_and_failures_do_not_stop_it(
-        self, root: Path, swept: Path, run_psotrack
-    ) -> None:
+        self, root, swept, run_psotrack
+    ):
         before = stamps(swept / "results")
         words = ("--data", root, "--out", swept / "results", "--cache", root / "cache", "--device", "cpu")
-        half = run_psotrack("sweep", swept / "half.toml", *words)
-        assert half.code == 2
+        half = run_psotrack("sweep", swept / "half.toml", *words).ended(2)
         assert "0 cells finished now, 4 before, 4 failed" in half.out
         status = run_psotrack("sweep", "--status", swept / "results")
         assert status.out.endswith("4 finished, 4 failed, 0 locked\n")
         assert status.out.count("nowhere") == 4
-        good = run_psotrack("sweep", swept / "good.toml", *words)
-        assert good.code == 0
+        good = run_psotrack("sweep", swept / "good.toml", *words).ended()
         assert "0 cells finished now, 4 before" in good.out
         assert stamps(swept / "results") == before
         # Both grids are noted, with the same origin as the rows.
@@ -151,7 +146,7 @@ class TestTracked:
         by_method = report("--rows", "method")
         assert "S01_D2_A" in by_method.out.splitlines()[2]
 
-    def test_only_the_instants_of_a_run_count(self, run) -> None:
+    def test_only_the_instants_of_a_run_count(self, run):
         """With fewer frames and another rate than the reference: drones are not missed where nothing was tracked."""
         varied = {"frames": [4], "rate_hz": [12.5]}
         rows = run({"sequences": ["S01_D2_A"], "settings": SETTINGS, "grid": varied}).rows()
@@ -163,7 +158,7 @@ class TestTracked:
 class TestRunner:
     """What is run, waited for, stored and run again, whatever the tracker finds."""
 
-    def test_rows_of_the_grid_and_plans(self, root: Path, run, tracker: Tracker, tmp_path: Path) -> None:
+    def test_rows_of_the_grid_and_plans(self, root, run, tracker, tmp_path):
         rows = run(varied(3, 4, runs=2)).rows()
         assert (rows["missed_rate"] == 1).all()
         assert seeds_of(run(varied(3, 4, runs=2))) == [[3, 0], [3, 1], [4, 0], [4, 1]]
@@ -177,10 +172,8 @@ class TestRunner:
         assert planned.to_dict()["finished"] == 1
         assert planned.to_dict()["runs"] == 2
 
-    def test_a_failure_is_removed_when_the_cell_is_finished(
-        self, run, tracker: Tracker, tmp_path: Path, monkeypatch
-    ) -> None:
-        dropped: list[int] = []
+    def test_a_failure_is_removed_when_the_cell_is_finished(self, run, tracker, tmp_path, monkeypatch):
+        dropped = []
         monkeypatch.setattr(runner, "drop_programs_if_many", lambda: dropped.append(1))
         tracker.failing = {3}
         words = "all failed: S01_D2_A swarm.iterations=3: ZeroDivisionError: planted"
@@ -198,12 +191,12 @@ class TestRunner:
         assert len(dropped) == 4
 
     def test_a_runner_waits_for_locked_cells_and_runs_them_when_they_are_unlocked(
-        self, root: Path, run, tracker: Tracker, tmp_path: Path, monkeypatch
-    ) -> None:
+        self, root, run, tracker, tmp_path, monkeypatch
+    ):
         attempts = []
         attempt = Locks.attempt
 
-        def noted_attempt(locks: Locks, path: Path):
+        def noted_attempt(locks, path):
             attempts.append(path)
             return attempt(locks, path)
 
@@ -222,7 +215,7 @@ class TestRunner:
             assert waiting.result().count("finished") == 2
         assert tracker.runs == [(4, [0]), (3, [0])]
 
-    def test_only_one_process_at_a_time_makes_the_silhouettes(self, root: Path, tmp_path: Path) -> None:
+    def test_only_one_process_at_a_time_makes_the_silhouettes(self, root, tmp_path):
         cell = grid_of(varied(3)).cells()[0]
         inputs = Inputs(root, tmp_path / "cache", jobs=1)
         inputs.keys_of(cell)
@@ -233,18 +226,16 @@ class TestRunner:
         assert given is not None
         assert given.silhouettes.num_frames == 6
 
-    def test_everything_that_a_cell_reads_changes_its_key(
-        self, root: Path, tmp_path: Path, monkeypatch
-    ) -> None:
+    def test_everything_that_a_cell_reads_changes_its_key(self, root, tmp_path, monkeypatch):
         """Rates, times of rows, kinds of lenses, the room, plugins and code, without videos of other content."""
         usual = open_recording(root / "Simulated_Data" / "S01_D2_A")
 
-        def key(recording, **settings: object) -> str:
+        def key(recording, **settings):
             (cell,) = grid_of(varied(3, **settings)).cells()
             monkeypatch.setattr(inputs, "open_recording", lambda folder: recording)
             return cell_key(cell, Inputs(root, root / "cache").keys_of(cell))
 
-        def with_cameras_of(**changes: object):
+        def with_cameras_of(**changes):
             return usual.with_rig(replace(usual.rig, cameras=replace(usual.rig.cameras, **changes)))
 
         slower = {name: replace(video, fps=20.0) for name, video in usual.videos.items()}
@@ -272,7 +263,7 @@ class TestRunner:
         assert len(set(keys)) == len(keys)
 
 
-def test_a_dry_run_shows_the_cells(tmp_path: Path, run_psotrack) -> None:
+def test_a_dry_run_shows_the_cells(tmp_path, run_psotrack):
     result = run_psotrack("sweep", grid_file(tmp_path, [3, 6], runs=2), "--dry-run")
     _, second, unread, last = result.out.splitlines()
     shown = " ".join(second.split())
@@ -281,7 +272,7 @@ def test_a_dry_run_shows_the_cells(tmp_path: Path, run_psotrack) -> None:
     assert last == "2 cells: 0 finished, 2 cannot be read, 0 to run (0 runs)"
 
 
-def test_wrong_calls_are_one_line(tmp_path: Path, run_psotrack) -> None:
+def test_wrong_calls_are_one_line(tmp_path, run_psotrack):
     command = partial(run_psotrack, "sweep", grid_file(tmp_path, [3]), "--out", tmp_path)
     alone = partial(command, "--workers", 2)
     assert_refused(alone, "--workers: expected --cluster local", unchanged=tmp_path)
@@ -291,10 +282,10 @@ def test_wrong_calls_are_one_line(tmp_path: Path, run_psotrack) -> None:
 
 
 @pytest.mark.slow
-def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path, monkeypatch) -> None:
+def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path, monkeypatch):
     """A change of the tracker changes the digest, one of the command line does not; no row needs what is left out."""
 
-    def digest_after(changed: str) -> str:
+    def digest_after(changed):
         path = tmp_path / changed
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:
@@ -317,7 +308,7 @@ def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path,
         assert not f"{path}/".startswith(left_out)
 
 
-def test_a_package_in_the_checkout_of_another_project_has_not_its_commit(tmp_path: Path, monkeypatch) -> None:
+def test_a_package_in_the_checkout_of_another_project_has_not_its_commit(tmp_path, monkeypatch):
     # Variables that a git hook sets must not decide the result.
     for name in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE"):
         monkeypatch.delenv(name, raising=False)

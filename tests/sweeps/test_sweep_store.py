@@ -35,30 +35,30 @@ with store.lock(sys.argv[2]):
 """
 
 
-def rows(*seeds: int, error_m: float = 0.01) -> pd.DataFrame:
+def rows(*seeds, error_m=0.01):
     return pd.DataFrame({"seed": list(seeds), "mean_error_m": [error_m + seed for seed in seeds]})
 
 
-def cell_path(store: Store) -> Path:
+def cell_path(store):
     return store.folder / "cells" / f"{KEY}.parquet"
 
 
-def lock_path(store: Store) -> Path:
+def lock_path(store):
     return store.folder / "cells" / f".{KEY}.lock"
 
 
-def is_free(store: Store) -> bool:
+def is_free(store):
     """Whether another runner gets the lock of the cell."""
     with store.lock(KEY) as locked:
         return locked
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path):
     return Store(tmp_path)
 
 
-def test_rows_of_more_seeds_are_added_and_a_seed_that_is_run_again_replaces_its_row(store: Store) -> None:
+def test_rows_of_more_seeds_are_added_and_a_seed_that_is_run_again_replaces_its_row(store):
     assert store.finished_seeds(KEY) == set()
     store.add(KEY, rows(2, 0))
     store.add(KEY, rows(1))
@@ -72,7 +72,7 @@ def test_rows_of_more_seeds_are_added_and_a_seed_that_is_run_again_replaces_its_
     assert store.rows({OTHER: [0], KEY: [0], "2" * 40: [0]})["mean_error_m"].tolist() == [5.0, 0.01]
 
 
-def test_only_the_input_that_was_used_last_counts(store: Store) -> None:
+def test_only_the_input_that_was_used_last_counts(store):
     """Rows of an older tracker, or of another recording, stay in the folder and are not mixed with the others."""
     for age_s, key, error_m in ((0, "a-new", 2.0), (1, "a-old", 1.0), (2, "b-old", 3.0)):
         store.add(key, rows(0, error_m=error_m))
@@ -86,7 +86,7 @@ def test_only_the_input_that_was_used_last_counts(store: Store) -> None:
     assert store.rows({"a-new": [0]})["mean_error_m"].tolist() == [2.0]
 
 
-def test_the_folder_is_a_parquet_data_set_of_the_rows(store: Store) -> None:
+def test_the_folder_is_a_parquet_data_set_of_the_rows(store):
     """Also with a failure, grids that were run, a locked cell and a half-written file in the folder."""
     assert_refused(store.status, "expected results of a sweep, found none", unchanged=store.folder)
     assert_refused(store.rows, "no finished cell", unchanged=store.folder)
@@ -118,7 +118,7 @@ def test_the_folder_is_a_parquet_data_set_of_the_rows(store: Store) -> None:
 # --- locks
 
 
-def test_one_runner_at_a_time_locks_a_cell(store: Store) -> None:
+def test_one_runner_at_a_time_locks_a_cell(store):
     with store.lock(KEY) as first:
         assert first
         for other in (store, Store(store.folder)):
@@ -133,9 +133,7 @@ def test_one_runner_at_a_time_locks_a_cell(store: Store) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="process start times are read from /proc")
-def test_the_lock_of_a_killed_process_of_this_machine_lapses_at_once_and_reading_starts_no_threads(
-    store: Store,
-) -> None:
+def test_the_lock_of_a_killed_process_of_this_machine_lapses_at_once_and_reading_starts_no_threads(store):
     """A thread of Arrow's that still had the content when a sweep ended aborted the sweep, once in fifty times."""
     store.add(KEY, rows(2, 0))
     command = [sys.executable, "-c", HOLDER, str(store.folder), KEY]
@@ -150,9 +148,7 @@ def test_the_lock_of_a_killed_process_of_this_machine_lapses_at_once_and_reading
     assert is_free(store)
 
 
-def test_a_lock_of_another_machine_lapses_when_it_is_not_touched(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_of_another_machine_lapses_when_it_is_not_touched(store, monkeypatch):
     """A process watches the file for the whole lease, because the clocks of two machines differ."""
     monkeypatch.setattr("psotrack.support.locks.LEASE_S", 1.0)
     monkeypatch.setattr("psotrack.support.locks.HEARTBEAT_S", 0.9)
@@ -168,7 +164,7 @@ def test_a_lock_of_another_machine_lapses_when_it_is_not_touched(
     wait_until(lambda: is_free(store))
 
 
-def test_an_empty_lock_lapses(store: Store) -> None:
+def test_an_empty_lock_lapses(store):
     """A machine that fails while it makes a lock leaves an empty file."""
     lock_path(store).parent.mkdir()
     lock_path(store).touch()
@@ -178,9 +174,7 @@ def test_an_empty_lock_lapses(store: Store) -> None:
     assert is_free(store)
 
 
-def test_a_holder_keeps_its_lock_and_leaves_that_of_its_successor(
-    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_holder_keeps_its_lock_and_leaves_that_of_its_successor(store, monkeypatch, caplog):
     """It loses the lock as after a machine was asleep, and logs it."""
     monkeypatch.setattr("psotrack.support.locks.HEARTBEAT_S", 0.01)
     with store.lock(KEY):
@@ -197,19 +191,11 @@ def test_a_holder_keeps_its_lock_and_leaves_that_of_its_successor(
 # --- damage
 
 
-@pytest.fixture(scope="module")
-def one_cell(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    """A folder with a finished cell."""
-    store = Store(tmp_path_factory.mktemp("one_cell"))
-    store.add(KEY, rows(0, 1, 2))
-    return store
-
-
 @given(data=st.data())
-def test_damage_is_an_error_that_names_the_file_and_never_another_result(
-    one_cell: Store, data: st.DataObject
-) -> None:
+def test_damage_is_an_error_that_names_the_file_and_never_another_result(tmp_path_factory, data):
     """One changed bit, or a file cut short: the same content as before, or an error of one line."""
+    one_cell = Store(tmp_path_factory.mktemp("one_cell"))
+    one_cell.add(KEY, rows(0, 1, 2))
     whole, file = one_cell.rows().to_csv(), cell_path(one_cell)
     content = file.read_bytes()
     damaged, place = bytearray(content), data.draw(st.integers(0, len(content) - 1))
@@ -229,7 +215,7 @@ def test_damage_is_an_error_that_names_the_file_and_never_another_result(
     assert found == whole or re.match(error, found)
 
 
-def test_a_damaged_cell_is_run_again(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_cell_is_run_again(store, caplog):
     store.add(KEY, rows(0, 1))
     content = bytearray(cell_path(store).read_bytes())
     content[len(content) // 3] ^= 1

@@ -78,10 +78,6 @@ def boxes_of(cameras, position_m, size_m):
     return jnp.stack([boxes.x_middle, boxes.y_middle, boxes.x_half, boxes.y_half], axis=-1)
 
 
-def new_births(rig, **rules):
-    return Births(rig.cameras, FlightLimits(FPS, ROOM_M, MAX_SPEED_M_S), BirthRules(**rules))
-
-
 def step(births, instant, images, *known_m, size_m=SIZE_M, rig=RIG):
     """The next frame, with known drones at some places."""
     position_m = np.array(known_m).reshape(-1, 3)
@@ -96,7 +92,7 @@ def step(births, instant, images, *known_m, size_m=SIZE_M, rig=RIG):
 
 def candidates_in(coverage, *known_m, size_m=SIZE_M, rig=RIG, first=0, **rules):
     """Candidates after all frames; `first` is the instant of the first frame."""
-    births = new_births(rig, **rules)
+    births = Births(rig.cameras, FlightLimits(FPS, ROOM_M, MAX_SPEED_M_S), BirthRules(**rules))
     for frame, images in enumerate(coverage):
         known = [one[frame] for one in known_m]
         step(births, first + frame, images, *known, size_m=size_m, rig=rig)
@@ -444,7 +440,6 @@ def assigned_drones(found, gone, **keywords):
 
 STILL_M_S = (0.0, 0.0, 0.0)
 HERE = candidate()
-NEARBY = candidate((0.0, 0.2, 1.0))
 #: Lost drones: half a metre before `HERE` and flying towards it, or away from it; beside; out of reach, which is three
 #: metres in half a second; long ago.
 AHEAD = Lost((-0.5, 0.0, 1.0))
@@ -479,11 +474,17 @@ HELD = replace(STOOD, doubtful=True)
 LOST_LATER = Lost((0.3, 0.0, 1.0), ago_s=-0.8)
 NOT_SURE = candidate(is_sure=False)
 
-#: What is the case: candidates, lost drones, and which lost drone each candidate is.
+#: While the background model learns the floor again, the rest of a ghost at a place seems to move.
+DYING, HERE_M = candidate((2.2, 1.4, 1.5), (-0.1, 0.04, 0.01)), {"left_m": [(2.2, 1.3, 1.5)]}
+#: As large as `LARGE`; and a rate of one drone that comes in every two seconds.
+AS_LARGE, OFTEN = replace(HERE, size_m=LARGE.span_m * np.ones(3)), {"new_per_s": 0.5}
+FAST_AWAY = replace(AWAY, velocity_m_s=(4.0, 0.0, 0.0), ago_s=1.5)
+
+#: What is the case: candidates, lost drones, which lost drone each candidate is, and what else is known.
 CASES = {
     "one of two flew towards the candidate": ([HERE], [AWAY, AHEAD], [1]),
     # The first drone fits both candidates best, but only one candidate gets it.
-    "each drone is one candidate": ([HERE, NEARBY], [AHEAD, BESIDE], [0, 1]),
+    "each drone is one candidate": ([HERE, candidate((0.0, 0.2, 1.0))], [AHEAD, BESIDE], [0, 1]),
     "out of reach": ([HERE], [FAR], [NEW]),
     "out of reach until time has passed": ([HERE], [replace(FAR, ago_s=10.0)], [0]),
     "long ago, of half the size": ([candidate(span_m=1.0)], [LONG_AGO], [NEW]),
@@ -510,37 +511,23 @@ CASES = {
     # A drone that was lost is found again by fewer frames than a new one.
     "not sure, but lost here": ([NOT_SURE], [AHEAD], [0]),
     "not sure": ([NOT_SURE], [], [NO_DRONE]),
+    "a fading ghost": ([DYING], [], [NO_DRONE], HERE_M),
+    "slow elsewhere": ([DYING], [], [NEW], {"left_m": [(1.2, 1.3, 1.5)]}),
+    "fast at the place of a ghost": ([candidate((2.2, 1.4, 1.5))], [], [NEW], HERE_M),
+    "lost at the place of a ghost": ([DYING], [Lost((2.2, 1.3, 1.5), STILL_M_S, 5.0)], [0], HERE_M),
+    # A lost drone that is expected anywhere does not come back where new drones come.
+    "lost long ago": ([AS_LARGE], [LARGE], [0]),
+    "lost long ago, and new drones come": ([AS_LARGE], [LARGE], [NEW], OFTEN),
+    "lost a moment ago, and new drones come": ([HERE], [AHEAD], [0], OFTEN),
+    "it flew away, and new drones come": ([HERE], [FAST_AWAY], [NEW], OFTEN),
+    "it departs, and new drones come": ([DEPARTING], [STOOD], [0], OFTEN),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_which_drone_a_candidate_is(case):
-    found, gone, expected = CASES[case]
-    assert assigned_drones(found, lost_tracks(*gone)) == expected
-
-
-def test_a_fading_ghost_is_not_new():
-    """While the background model learns the floor again, the rest of the ghost seems to move."""
-    dying = candidate((2.2, 1.4, 1.5), (-0.1, 0.04, 0.01))
-    left_m = [(2.2, 1.3, 1.5)]
-    assert assigned_drones([dying], lost_tracks(left_m=left_m)) == [NO_DRONE]
-    # A slow candidate elsewhere is new, and so is a fast candidate at this place; a drone lost here may be found again.
-    assert assigned_drones([dying], lost_tracks(left_m=[(1.2, 1.3, 1.5)])) == [NEW]
-    assert assigned_drones([candidate((2.2, 1.4, 1.5))], lost_tracks(left_m=left_m)) == [NEW]
-    assert assigned_drones([dying], lost_tracks(Lost(left_m[0], STILL_M_S, 5.0), left_m=left_m)) == [0]
-
-
-def test_where_new_drones_come_a_lost_one_that_is_expected_anywhere_does_not_come_back():
-    """Of two drones lost long ago and a moment ago; one comes in every two seconds."""
-    often = {"new_per_s": 0.5}
-    for found, gone, known, expected in (
-        (replace(HERE, size_m=LARGE.span_m * np.ones(3)), LARGE, {}, 0),
-        (replace(HERE, size_m=LARGE.span_m * np.ones(3)), LARGE, often, NEW),
-        (HERE, AHEAD, often, 0),
-        (HERE, replace(AWAY, velocity_m_s=(4.0, 0.0, 0.0), ago_s=1.5), often, NEW),
-        (DEPARTING, STOOD, often, 0),
-    ):
-        assert assigned_drones([found], lost_tracks(gone, **known)) == [expected]
+    found, gone, expected, *known = CASES[case]
+    assert assigned_drones(found, lost_tracks(*gone, **dict(*known))) == expected
 
 
 def test_only_so_many_candidates_are_drones():

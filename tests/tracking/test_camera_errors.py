@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from helpers import ring_rig
+from helpers import fading, ring_rig
 from motion_textbook import Model
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
@@ -68,11 +68,8 @@ def turned(rig, angle_deg, rng):
 
 def correlated(rng, shape, share, frames):
     """Errors of variance 1, a share of which fades exponentially over some frames, the rest white."""
-    decay = np.exp(-1 / frames)
-    fading = rng.normal(size=shape)
-    for frame in range(1, shape[0]):
-        fading[frame] = decay * fading[frame - 1] + np.sqrt(1 - decay**2) * fading[frame]
-    return np.sqrt(share) * fading + np.sqrt(1 - share) * rng.normal(size=shape)
+    lasting = fading(rng.normal(size=shape), np.exp(-1 / frames))
+    return np.sqrt(share) * lasting + np.sqrt(1 - share) * rng.normal(size=shape)
 
 
 def fitted_views(rig, stated, position_m, velocity_m_s, error_px):

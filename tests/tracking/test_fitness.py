@@ -10,10 +10,11 @@ from itertools import product
 import jax
 import numpy as np
 import pytest
-from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, ring_rig
+from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, posed, ring_rig, simple_lens
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from windows import best_place, camera_at, cut_at
+from pixel_sums import area_weighted_sum
+from windows import best_place, cut_at
 
 from psotrack.foreground.silhouettes import summed_area_table
 from psotrack.tracking.swarm import SoftIoU
@@ -137,17 +138,6 @@ def test_particles_and_drones_do_not_interact(settings):
     np.testing.assert_array_equal(changed != fitness[order], differs[order])
 
 
-def pixels_in(image, low, high):
-    """Sum over a box from (x, y) to (x, y) in float64: each pixel is weighted by its share inside the box."""
-    shares = []
-    for axis, count in ((1, image.shape[0]), (0, image.shape[1])):
-        pixel = np.arange(count)
-        inside = np.minimum(high[axis], pixel + 1) - np.maximum(low[axis], pixel)
-        shares.append(np.clip(inside, 0, 1))
-    rows, columns = shares
-    return rows @ image.astype(np.float64) @ columns
-
-
 def numpy_box(camera, middle_m, size_m):
     """Middle and half lengths, (x, y), of the box around the outline of an ellipsoid, from the outline's dual conic."""
     move = np.eye(4)
@@ -171,7 +161,7 @@ def numpy_fitness(rig, images, middle_m, size_m, settings, reduction=2):
             """Foreground and area of the box, enlarged and cut at the image's border, in the silhouette's pixels."""
             low = np.clip(middle - scale * half, 0, side_px) / reduction
             high = np.clip(middle + scale * half, 0, side_px) / reduction
-            return pixels_in(image, low, high) / 255, np.prod(high - low)
+            return area_weighted_sum(image, (*low, *high)) / 255, np.prod(high - low)
 
         ring, _ = window(settings.ring)
         each = []
@@ -291,10 +281,10 @@ def test_the_vertex_is_that_of_the_least_squares_paraboloid():
 
 def test_cameras_on_one_side_know_that_the_depth_is_uncertain():
     """Three cameras within nine degrees. Regression: variances were limited to a ratio of 50."""
-    cameras = []
+    cameras, lens = [], simple_lens(450.0, (480, 360))
     for angle in (-0.08, 0.0, 0.08):
         place_m = (4 * np.cos(angle), 4 * np.sin(angle), 1.2)
-        cameras.append(camera_at(place_m, (0.0, 0.0, 1.2), focal_px=450.0, image_size_wh=(480, 360)))
+        cameras.append(posed(lens, place_m, (0.0, 0.0, 1.2)))
     rig = make_unnamed_rig(*cameras)
     truth = np.array([[0.02, -0.03, 1.21]])
     found = vertex(shown(truth, rig), truth, rig)

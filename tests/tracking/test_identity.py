@@ -329,11 +329,8 @@ class TestAmbiguity:
 @settings(max_examples=20)
 def test_smoothing_states_no_place_for_a_lost_drone_and_none_outside_of_the_room(lengths, seed):
     """A drone is seen and not seen in turn, and is lost in the fourth frame of a gap; then it is somewhere else."""
-    rng, frame, room_m = (
-        np.random.default_rng(seed),
-        np.arange(60),
-        np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]]),
-    )
+    rng, frame = np.random.default_rng(seed), np.arange(60)
+    room_m = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]])
     seen = np.resize(np.repeat(np.arange(len(lengths)) % 2 == 0, lengths), 60)
     missed = frame - np.maximum.accumulate(np.where(seen, frame, 0))
     status = np.where(seen, Status.TRACKED, np.where(missed > 3, Status.LOST, Status.COASTING))

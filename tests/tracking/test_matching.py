@@ -1,11 +1,12 @@
 """Correspondence of detections: OpenCV's epipolar lines, all assignments of small scenes, and merged detections."""
 
+from dataclasses import replace
 from itertools import product
 
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, make_unnamed_rig, move_world, project_points, ring_rig
+from helpers import LENSES, make_unnamed_rig, move_world, opencv_pixels, project_points, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -98,9 +99,7 @@ def test_a_sighting_is_at_the_middle_of_its_box_and_is_less_certain_at_the_image
 def distort_by_opencv(cam, straight):
     """Pixels after distortion by OpenCV, from pixels without distortion."""
     rays = np.column_stack([straight, np.ones(len(straight))]) @ np.linalg.inv(cam.K).T
-    still = np.zeros(3)
-    pixels, _ = cv2.projectPoints(rays, still, still, cam.K, np.array(cam.dist))
-    return pixels[:, 0]
+    return opencv_pixels(replace(cam, T_cam_world=np.eye(4)), rays)
 
 
 def opencv_distance(points, image, F, others):

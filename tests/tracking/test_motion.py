@@ -221,7 +221,7 @@ class TestOutliers:
 # --- the smoother and the estimate of the jerk density, compared with one joint Gaussian, statistics, and symmetries
 
 
-def smooth_flight(flown: SimulatedFlight):
+def smooth_flight(flown):
     return smooth(flown.measurements, flown.params)
 
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import make_unnamed_rig, ring_rig
+from board_rigs import record_detections
+from helpers import make_unnamed_rig, posed, ring_rig, simple_lens
 from seen_boxes import FPS, boxes_of, joined, see, track, true_boxes
 
 from psotrack.errors import InputError
 from psotrack.evaluation import evaluate
-from psotrack.geometry import look_at, make_camera, project
-from psotrack.geometry.rig_files import write_rig
+from psotrack.geometry import project
 from psotrack.pipeline import track_recording
-from psotrack.recordings import Detections, write_detections
+from psotrack.recordings import Detections
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import DroneSettings, StatusSettings, TrackSettings
 from psotrack.tracking.births import (
@@ -162,7 +162,7 @@ def test_a_given_drone_that_is_seen_late_keeps_its_number():
 def test_bodies_that_pass_one_after_the_other_are_as_many_tracks(same_way):
     """Fourteen bodies cross the view of three cameras at 4 to 12 m/s, one to three seconds after the last one."""
     rng, num = np.random.default_rng(0), 14
-    rig = make_unnamed_rig(*(camera_at((x_m, -6.0, 2.0), (0.0, 0.0, 1.5)) for x_m in (-4.0, 0.0, 4.0)))
+    rig = make_unnamed_rig(*(posed(LENS, (x_m, -6.0, 2.0), (0.0, 0.0, 1.5)) for x_m in (-4.0, 0.0, 4.0)))
     speed_m_s, angle = rng.uniform(4.0, 12.0, num), rng.uniform(0, 2 * np.pi, num)
     ahead = np.stack([np.cos(angle), np.sin(angle), 0.1 * rng.normal(size=num)], axis=-1)
     ahead = np.array([1.0, 0.1, 0.0]) if same_way else ahead
@@ -369,21 +369,15 @@ def test_drones_whose_boxes_merge_keep_their_tracks():
 FORMULA = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "accuracy" / "formula_flights.py"))
 SCENES, make_flight = FORMULA["SCENES"], FORMULA["make_flight"]
 
-K = np.array([[1000.0, 0, 960], [0, 1000.0, 540], [0, 0, 1]])
-SKY_M = (0.0, 0.0, 15.0)
+LENS = simple_lens(1000.0, (1920, 1080))
 
 
-def camera_at(place_m, target_m):
-    R, t_m = look_at(place_m, target_m)
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
-
-
-def ground_rig(num_cameras, target_m=SKY_M, height_m=1.5):
+def ground_rig(num_cameras, target_m=(0.0, 0.0, 15.0), height_m=1.5):
     """Cameras on the ground on a circle of 25 m, which all look at one place."""
     cameras = []
     for angle in 2 * np.pi * np.arange(num_cameras) / num_cameras + 0.3:
         place_m = [25 * np.cos(angle), 25 * np.sin(angle), height_m]
-        cameras.append(camera_at(place_m, target_m))
+        cameras.append(posed(LENS, place_m, target_m))
     return make_unnamed_rig(*cameras)
 
 
@@ -540,7 +534,7 @@ def test_a_track_that_is_cut_off_is_named_with_the_option(largest_y_m, max_speed
 def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
     """The room's middle is between the cameras, where a ray has no depth yet; the drone is 100 m away."""
     aim_m = [0.0, 80.0, 60.0]
-    left, right = camera_at([-7.0, 0.0, 1.5], aim_m), camera_at([7.0, 0.0, 1.5], aim_m)
+    left, right = posed(LENS, [-7.0, 0.0, 1.5], aim_m), posed(LENS, [7.0, 0.0, 1.5], aim_m)
     pair = make_unnamed_rig(left, right).cameras
     place_m = np.array([[3.0, 80.0, 60.0]])
     pixels, _ = project(pair, place_m)
@@ -550,15 +544,13 @@ def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
 
 
 def write_recording(folder, rig, sightings):
-    write_rig(folder / "rig.toml", rig)
-    lines = ["version = 1", 'calibration = "rig.toml"']
+    seen = {}
     for camera, name in enumerate(rig.names):
         frame, box = np.nonzero(np.isfinite(sightings.noise_px[:, camera]))
         centre = sightings.centre_px[frame, camera, box] + 0.5
         boxes = np.concatenate([centre - 6, centre + 6], axis=1)
-        write_detections(folder / f"{name}.csv", Detections(frame, boxes, np.ones(len(frame))))
-        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', "size = [1920, 1080]", f"fps = {FPS}"]
-    (folder / "recording.toml").write_text("\n".join(lines) + "\n")
+        seen[name] = Detections(frame, boxes, np.ones(len(frame)))
+    record_detections(folder, seen, rig)
 
 
 def test_a_camera_that_shows_no_drone_where_the_tracks_have_one_is_named(tmp_path, caplog):

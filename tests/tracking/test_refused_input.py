@@ -1,8 +1,5 @@
 """Messages of the tracking room: settings and measurements that it cannot use."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers import assert_refused, track_settings
@@ -14,14 +11,14 @@ from psotrack.tracking.motion import smooth
 from psotrack.tracking.swarm import tracker_settings
 
 
-def causal(name: str, value: object) -> Callable[[], object]:
+def causal(name, value):
     return lambda: causal_settings(TrackSettings().changed({name: value}))
 
 
-def measured(function: Callable, array: str, index: object, value: object) -> Callable[[], object]:
+def measured(function, array, index, value):
     """A call with measurements of two drones in 30 frames, of which one value is wrong."""
 
-    def call() -> object:
+    def call():
         flown = simulate_flight(18, frames=30, drones=2)
         getattr(flown, array)[index] = value
         return function(flown.measurements, flown.params)
@@ -29,7 +26,7 @@ def measured(function: Callable, array: str, index: object, value: object) -> Ca
     return call
 
 
-def kernel(**options: object) -> Callable[[], object]:
+def kernel(**options):
     return lambda: tracker_settings(track_settings(search="pso-kernel", **options))
 
 
@@ -55,6 +52,6 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+def test_bad_input_is_refused_in_one_line(case, tmp_path):
     make, *words = BAD[case]
     assert_refused(make, *words, unchanged=tmp_path)

@@ -30,7 +30,7 @@ def params(groups=1, dims=2, *, max_step=10.0, low=-100.0, high=100.0, **coeffic
 
 
 def sphere(position):
-    return -jnp.square(position).sum(axis=-1)
+    return -(position**2).sum(axis=-1)
 
 
 def random_positions(particles, groups, dims, seed=0, scale=5.0):
@@ -91,7 +91,7 @@ def test_one_step_of_three_particles_by_hand(max_step):
 
     velocity = as_particles([0.5, 0, 1, -1], [0, 1, -0.5, 0], [0.25, 0.25, 0, -2])
     pbest = as_particles([1, 2, 3, 0], [2, -1, 1, 1], [-2, 2, 0, 2])
-    before = replace(before, velocity=velocity, pbest_position=pbest, pbest_fitness=value_of(pbest))
+    before = replace(before, velocity=velocity, pbest_position=pbest, pbest_fitness=sphere(pbest))
     key = jax.random.key(7)
     after = step(key, sphere, before, knobs)
 
@@ -101,9 +101,9 @@ def test_one_step_of_three_particles_by_hand(max_step):
     pull = 0.5 * velocity + to_own_best + to_best_of_group
     expected_velocity = np.clip(pull, -max_step, max_step)
     expected_position = position + expected_velocity
-    better = value_of(expected_position) > value_of(pbest)
+    better = sphere(expected_position) > sphere(pbest)
     expected_pbest = np.where(better[..., None], expected_position, pbest)
-    expected_fitness = value_of(expected_pbest)
+    expected_fitness = sphere(expected_pbest)
     leader = expected_fitness.argmax(axis=0)
     # A few float32 operations on numbers below 5, with rounding errors of 6e-7 each.
     np.testing.assert_allclose(after.velocity, expected_velocity, atol=5e-6)
@@ -117,10 +117,6 @@ def test_one_step_of_three_particles_by_hand(max_step):
 def as_particles(*rows):
     """(particles, 2 groups, 2 dimensions), from one row of four numbers per particle."""
     return np.array(rows, np.float32).reshape(-1, 2, 2)
-
-
-def value_of(position):
-    return -np.square(position).sum(axis=-1)
 
 
 def ripples(position):

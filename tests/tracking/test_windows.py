@@ -6,7 +6,7 @@ In tests by hand, cameras are so far away that metres are pixels.
 import jax
 import numpy as np
 import pytest
-from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, ring_rig
+from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, posed, ring_rig, simple_lens
 from hypothesis import example, given
 from hypothesis import strategies as st
 from windows import (
@@ -14,7 +14,6 @@ from windows import (
     PIXELS_PER_M,
     RING,
     SHAPE,
-    camera_at,
     cut_at,
     enumerate_windows,
     evaluate,
@@ -336,11 +335,10 @@ def test_middles_agree_with_moments_in_float64():
 
 def test_the_height_of_a_flat_drone_seen_from_above_is_not_measured():
     """Cameras on the ceiling look straight down, so the height has almost no effect on their views."""
-    cameras = []
+    cameras, lens = [], simple_lens(500.0, (640, 480))
     for i in range(3):
         place_m, floor_m = (0.3 * i, -0.2 * i, 5.0), (0.3 * i, -0.2 * i + 0.01, 0.0)
-        up = (0.0, 1.0, 0.0)
-        cameras.append(camera_at(place_m, floor_m, focal_px=500.0, image_size_wh=(640, 480), up=up))
+        cameras.append(posed(lens, place_m, floor_m, up=(0.0, 1.0, 0.0)))
     rig = make_unnamed_rig(*cameras)
     at, flat = np.array([0.3, -0.2, 1.0]), np.array([0.5, 0.5, 0.08])
     shown = seen_in(draw(at, flat, rig), at, flat, rig=rig).size_ratio[0]

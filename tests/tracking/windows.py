@@ -9,7 +9,7 @@ import numpy as np
 from helpers import far_camera, float32, make_unnamed_rig
 
 from psotrack.foreground.silhouettes import LOW_BITS, summed_area_table
-from psotrack.geometry import look_at, make_camera, make_extents
+from psotrack.geometry import make_extents
 from psotrack.tracking.swarm import SoftIoU
 from psotrack.tracking.swarm.fitness import ScoreInputs, drone_fitness, score_inputs
 from psotrack.tracking.swarm.patches import SIDE, ExpectedDrones, cut, make_pyramid
@@ -30,14 +30,6 @@ def far_rig(reduction):
     return make_unnamed_rig(
         *(far_camera(image_size_wh=sides, pixels_per_m=reduction * ppm) for ppm in PIXELS_PER_M)
     )
-
-
-def camera_at(place_m, target_m, *, focal_px, image_size_wh, up=(0.0, 0.0, 1.0)):
-    """A camera without distortion that looks at a place."""
-    R, t_m = look_at(place_m, target_m, up=up)
-    width, height = image_size_wh
-    K = np.array([[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]])
-    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
 
 
 def middle_px(position_m, pixels_per_m):

@@ -1,9 +1,6 @@
 """Tables that grow: a full disk, an error or a killed process costs no row that was written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ FLIGHT = replace(make_tracks(), drones=('a "b", c', "NA"))
 FRAMES = [FLIGHT.at_frames(np.array([frame])) for frame in FLIGHT.frame]
 
 
-def test_a_table_that_grew_is_the_one_that_is_written_at_once(tmp_path: Path) -> None:
+def test_a_table_that_grew_is_the_one_that_is_written_at_once(tmp_path):
     path = tmp_path / "rows.csv"
     write_trajectories(tmp_path / "once.csv", FLIGHT)
     with RowStream(path) as rows:
@@ -29,7 +26,7 @@ def test_a_table_that_grew_is_the_one_that_is_written_at_once(tmp_path: Path) ->
     assert path.read_bytes() == (tmp_path / "once.csv").read_bytes()
 
 
-def test_a_table_that_exists_is_not_replaced(tmp_path: Path) -> None:
+def test_a_table_that_exists_is_not_replaced(tmp_path):
     (tmp_path / "rows.csv").write_text("mine")
     with pytest.raises(OutputError, match=r"rows\.csv"):
         RowStream(tmp_path / "rows.csv")
@@ -38,11 +35,11 @@ def test_a_table_that_exists_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "rows.csv").read_text() == "mine"
 
 
-def test_a_full_disk_costs_only_what_did_not_fit(tmp_path: Path) -> None:
+def test_a_full_disk_costs_only_what_did_not_fit(tmp_path):
     """A limit on the size of files stands for a full disk: both cut off a row in its middle."""
     path, written = tmp_path / "rows.csv", []
 
-    def write(num_bytes: int) -> None:
+    def write(num_bytes):
         with files_up_to(num_bytes), RowStream(path, force=True) as rows:
             for frame in FRAMES:
                 rows.write(frame)
@@ -57,7 +54,7 @@ def test_a_full_disk_costs_only_what_did_not_fit(tmp_path: Path) -> None:
     assert 0 < read_trajectories(path).num_frames == len(written) < len(FRAMES)
 
 
-def test_an_older_file_stays_until_the_first_row(tmp_path: Path) -> None:
+def test_an_older_file_stays_until_the_first_row(tmp_path):
     path = tmp_path / "rows.csv"
     record = tmp_path / "rows.json"
     record.write_text("about the older rows")

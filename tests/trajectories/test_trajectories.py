@@ -26,7 +26,7 @@ def flight(**changes):
     return Trajectories(**(values | changes))
 
 
-def full_flight() -> Trajectories:
+def full_flight():
     rng = np.random.default_rng(0)
     return flight(
         velocity_m_s=rng.normal(size=(FRAMES, DRONES, 3)),

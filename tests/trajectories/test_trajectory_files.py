@@ -21,7 +21,7 @@ SUFFIXES = (".csv", ".parquet")
 HEADER = "frame,time_s,drone,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s,fitness,num_cameras,status"
 
 
-def two_drones(dtype=np.float32) -> Trajectories:
+def two_drones(dtype=np.float32):
     """Three frames of two drones; the second drone is lost in the last frame, with an unknown position."""
     position_m = np.array([[[0.1, -2, 1.5], [3, 4, 1]]] * 3, dtype)
     position_m[2, 1] = np.nan
