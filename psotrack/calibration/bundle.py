@@ -296,24 +296,11 @@ class Bundle:
         by_target = [-by_world @ cross_matrices(arm), by_world]
         if problem.cameras_are_blocks:
             by_target.append(by_world @ arm[..., None])
-            by_shared, by_block = [by_lens, *by_target], by_camera
+            by_shared, by_block, is_free = [by_lens, *by_target], by_camera, problem.free_camera[:, None]
         else:
-            by_shared, by_block = [by_lens, *by_camera], by_target
-        return (
-            off,
-            np.concatenate(by_shared, axis=-1),
-            np.concatenate(by_block, axis=-1) * self._is_free_block,
-        )
-
-    @property
-    def _is_free_block(self) -> Float[np.ndarray, "sightings 1 1 *m"]:
-        """Whether the unknowns of a sighting's block are adjusted."""
-        free = (
-            self.problem.free_camera[:, None]
-            if self.problem.cameras_are_blocks
-            else self.problem.free_target[:, :6]
-        )
-        return free[self.problem.block, None, None].astype(np.float64)
+            by_shared, by_block, is_free = [by_lens, *by_camera], by_target, problem.free_target[:, :6]
+        of_block = np.concatenate(by_block, axis=-1) * is_free[problem.block, None, None]
+        return off, np.concatenate(by_shared, axis=-1), of_block
 
     @cached_property
     def distance_px(self) -> Float[np.ndarray, "sightings corners"]:

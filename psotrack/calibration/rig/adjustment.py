@@ -106,6 +106,14 @@ class CalibratedRig:
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
     shared: Int[np.ndarray, "cameras cameras"]
 
+    @property
+    def view_px(self) -> Float[np.ndarray, "cameras instants"]:
+        """(cameras, instants), median distance of a view's corners, pixels; NaN of a camera that does not see it."""
+        seen = ~np.isnan(self.residual_px).all(axis=-1)
+        medians = np.full(seen.shape, np.nan)
+        medians[seen] = np.nanmedian(self.residual_px[seen], axis=-1)
+        return medians
+
 
 @dataclass(frozen=True)
 class LensChoice:

@@ -94,6 +94,11 @@ class PointRig:
     residual_px: Float[np.ndarray, "sightings cameras"]
     used: Bool[np.ndarray, "sightings cameras"]
 
+    def by_number(self, point: int) -> dict[int, Float[np.ndarray, "3"]]:
+        """Positions of a point, or of one end of a stick, by the number of the instant."""
+        of_point = self.views.point == point
+        return dict(zip(self.views.number[of_point].tolist(), self.points_m[of_point], strict=True))
+
 
 def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
     """Place cameras with known lenses by a point that moves before them.

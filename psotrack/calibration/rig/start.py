@@ -315,7 +315,7 @@ def join_cameras(
             # The error, which is below 1, decides between pairs of which equally many instants agree.
             cost[first, second] = 1 + shared.max() - agreeing + error
     order, before = breadth_first_order(minimum_spanning_tree(cost), 0, directed=False)
-    check_joined(views, shared)
+    _check_joined(views, shared)
     T_cam_world = np.tile(np.eye(4), (count, 1, 1))
     for camera in order[1:]:
         T_cam_world[camera] = steps[before[camera], camera] @ T_cam_world[before[camera]]
@@ -379,18 +379,9 @@ def _place_boards(
     return boards, labelling
 
 
-def check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"] | None = None) -> None:
-    """Check that instants at which two cameras see the board join all cameras.
-
-    Args:
-        views: the views.
-        shared: number of instants that two cameras share; None: those at which both see enough corners.
-
-    Raises:
-        InputError: the cameras are not all joined.
-    """
-    seen = views.seen.astype(np.int64)
-    count, group = connected_components(seen @ seen.T if shared is None else shared, directed=False)
+def _check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"]) -> None:
+    """Check that instants at which two cameras see the board, whose numbers are given, join all cameras."""
+    count, group = connected_components(shared, directed=False)
     if count > 1:
         first, second = ([views.names[index] for index in np.flatnonzero(group == one)] for one in (0, 1))
         parts = f"one of {', '.join(first)} and one of {', '.join(second)}"
