@@ -22,7 +22,7 @@ from psotrack.recordings import datasets
 from psotrack.support import POSITION, finite_or_none, format_numbers
 
 if TYPE_CHECKING:
-    from psotrack.foreground.markers import DetectedMarkers
+    pass
 
 
 @command("detect")
@@ -60,19 +60,14 @@ def detect_markers(
     output.refuse(out)
     marker_dictionary(dictionary)
     photographs = _photographs(images)
-    found: list[DetectedMarkers]
+    source: inside_out.FrameSource | list[Path]
     if photographs is None:
-        names, what = None, "frames"
-        found = list(
-            inside_out.markers_of_video(
-                inside_out.open_source(images[0]).first(num_frames), dictionary, output.report
-            )
-        )
+        names, what, source = None, "frames", inside_out.open_source(images[0]).first(num_frames)
+    elif num_frames is not None:
+        raise SettingsError("--frames", expected="a video", found="images")
     else:
-        if num_frames is not None:
-            raise SettingsError("--frames", expected="a video", found="images")
-        names, what = _names(photographs), "images"
-        found = list(inside_out.markers_of_images(photographs, dictionary, output.report))
+        names, what, source = _names(photographs), "images", photographs
+    found = list(inside_out.markers_of(source, dictionary, output.report))
     inside_out.write_marker_table(out, found, names, force=output.force)
     counts = Counter(marker for markers in found for marker in markers.ids.tolist())
     showing = sum(len(markers) > 0 for markers in found)

@@ -64,16 +64,15 @@ def choose_agility(
 
     best = (0, 0)
     for stride in _STRIDES:
-        while (better := max(_steps_around(best, stride), key=lambda steps: likelihood(*steps))) != best:
+        # These steps, and those that differ from them by a stride in one number.
+        beside = ((0, 0), (-stride, 0), (stride, 0), (0, -stride), (0, stride))
+        while True:
+            around = [(best[0] + along, best[1] + about) for along, about in beside]
+            better = max(around, key=lambda steps: likelihood(*steps))
+            if better == best:
+                break
             best = better
     return _agility(*best)
-
-
-def _steps_around(steps: tuple[int, int], stride: int) -> list[tuple[int, int]]:
-    """These steps, and those that differ from them by a stride in one number."""
-    along, about = steps
-    beside = [(along + sign * stride, about) for sign in (-1, 1)]
-    return [steps, *beside, *((along, about + sign * stride) for sign in (-1, 1))]
 
 
 def _agility(along: int, about: int) -> Agility:

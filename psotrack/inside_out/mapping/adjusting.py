@@ -211,7 +211,10 @@ def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarra
     except np.linalg.LinAlgError:
         # A marker whose sightings are all outliers is undetermined, so no covariance is known.
         inverse = np.full_like(reduced.information, np.nan)
-    axes = _axes(sightings)
+    # Unit vectors as columns, (sightings, 4, 2, 2): away from the middle of the marker, and across.
+    out = outward(sightings)
+    out = out / np.linalg.norm(out, axis=-1, keepdims=True)
+    axes = np.stack([out, np.stack([-out[..., 1], out[..., 0]], axis=-1)], axis=-1)
     by_corner = (inverse @ _pulls(bundle, axes, reduced.gain))[videos:]
     # All four corners of a marker move outwards by sqrt(2) px where its sides move by 1 px.
     by_marker = np.sqrt(2) * by_corner.reshape(-1, count, 4, 2)[..., 0].sum(axis=-1)
@@ -227,13 +230,6 @@ def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarra
     centre_first = [3, 4, 5, 0, 1, 2, 6]
     of_markers = np.einsum("aiaj->aij", whole.reshape(count, 7, count, 7))
     return of_markers[:, centre_first][:, :, centre_first]
-
-
-def _axes(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2 2"]:
-    """(sightings, 4, 2, 2), unit vectors as columns: away from the middle of the marker, and across."""
-    out = outward(sightings)
-    out = out / np.linalg.norm(out, axis=-1, keepdims=True)
-    return np.stack([out, np.stack([-out[..., 1], out[..., 0]], axis=-1)], axis=-1)
 
 
 def _kept_px(bundle: Bundle, axes: Float[np.ndarray, "sightings 4 2 2"]) -> float:
