@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack import __version__
-from psotrack.calibration import Board
+from psotrack.calibration import Board, Similarity
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, undistort
 from psotrack.geometry.rig_files import write_rig
@@ -340,16 +340,9 @@ def _write_tables(folder: Path, scene: Scene, rig: Rig, floor: PosedBoard, durat
         orientation_wxyz=np.stack([flight.orientation_wxyz(times) for flight in scene.flights], axis=1),
     )
     write_tum(folder, trajectories)
-    write_rig(folder / "truth" / "rig.toml", moved(rig, origin_m))
+    write_rig(folder / "truth" / "rig.toml", Similarity(np.eye(3), -origin_m).rig(rig))
     rows = [[one.name, one.flight, one.fps, one.start_s] for one in OWN_CAMERAS]
     write_rows(folder / "truth" / "clocks.csv", [["camera", "video", "fps", "start_s"], *rows], separator=",")
-
-
-def moved(rig: Rig, origin_m: Point) -> Rig:
-    """The rig in a world with another origin and the same axes."""
-    T = np.array(rig.cameras.T_cam_world)
-    T[:, :3, 3] += T[:, :3, :3] @ origin_m
-    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
 def _write_record(folder: Path, scene: Scene, num_frames: int) -> None:

@@ -110,13 +110,9 @@ def mirror(room: Room, cam: raster.Pinhole, imaging: Imaging, empty: Backdrop) -
     light = render_light(below, cam, imaging.antialiasing)
     beyond = np.clip(1 - empty.depth_m / depth, 0, 1)
     floor = lens_blur(empty.floor.astype(np.float32), imaging.lens_blur_px)
-    share = fresnel(_cosine_to_floor(cam), imaging.reflections) * floor
+    # By the cosine of the angle of incidence (Schlick, 1994); 1 at grazing incidence.
+    share = (imaging.reflections + (1 - imaging.reflections) * (1 - _cosine_to_floor(cam)) ** 5) * floor
     return Mirror(cam, share, _blurred(light, beyond, ROUGHNESS_RAD * cam.K[0, 0], imaging), depth)
-
-
-def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.ndarray, "*shape"]:
-    """Share of mirrored light by the cosine of the angle of incidence (Schlick, 1994); 1 at grazing incidence."""
-    return at_normal + (1 - at_normal) * (1 - cosine) ** 5
 
 
 def _cosine_to_floor(cam: raster.Pinhole) -> _Pixels:

@@ -88,10 +88,6 @@ class CameraRenderer:
         self.scenery.light(image, self.scene.time_s(frame))
         return image
 
-    def empty_room(self) -> Image:
-        """(height, width, 3), BGR image of the room without drones and without the effects of the sensor."""
-        return self.assemble([view.empty_room() for view in self.views])
-
     def assemble(self, images: Sequence[_Part]) -> Image:
         """(height, width, 3), the image of the camera, from the images of its views; their sizes may differ."""
         return images[0] if self.lens is None else self.lens.assemble(images)

@@ -49,12 +49,8 @@ def floor(width_m: float, height_m: float, texel_m: float, rng: np.random.Genera
             _rectangle(texture, texel_m, (x, y, x + gap_m, y + board_m), (0.6,) * 3)
             x += length_m
         _rectangle(texture, texel_m, (0.0, y, width_m, y + gap_m), (0.6,) * 3)
-    yellow, line_m = (0.7, 2.2, 2.4), 0.05
-    left, right, top, bottom = 0.2 * width_m, 0.8 * width_m, 0.125 * height_m, 0.875 * height_m
-    for x in (left, right):
-        _rectangle(texture, texel_m, (x, top, x + line_m, bottom), yellow)
-    for y in (top, bottom):
-        _rectangle(texture, texel_m, (left, y, right + line_m, y + line_m), yellow)
+    of_flights_m = (0.2 * width_m, 0.125 * height_m, 0.8 * width_m, 0.875 * height_m)
+    _outline(texture, texel_m, of_flights_m, (0.7, 2.2, 2.4))
     x, y = 0.5 * width_m, 0.5 * height_m
     _rectangle(texture, texel_m, (x + 0.6, y - 1.0, x + 2.6, y + 1.0), (1.3, 0.8, 0.55))
     _rectangle(texture, texel_m, (x - 2.4, y + 0.6, x - 0.8, y + 2.2), (0.62, 0.58, 0.55))
