@@ -50,6 +50,7 @@ _MOST_SQUARES = 20
 _FITS, _USUAL_MARKER = 0.15, 0.75
 
 _Images = Sequence[UInt8[np.ndarray, "_ _"]]
+_Corners = Float[np.ndarray, "corners 2"]
 #: Markers of one family in an image: number of each and its corners, (4, 2), pixels.
 _Markers = dict[int, Float[np.ndarray, "4 2"]]
 
@@ -62,12 +63,8 @@ class BoardFinder:
 
     def find(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
         """Pixels of the board's corners, (corners, 2); NaN where a corner is not found, everywhere if few are."""
-        if self.board.kind == "chessboard":
-            found = self._find_chessboard(grey)
-        elif self.board.kind == "grid":
-            found = self._find_grid(grey)
-        else:
-            found = self._find_charuco(grey)
+        found = np.full((self.board.num_corners, 2), np.nan)
+        getattr(self, f"_find_{self.board.kind}")(grey, found)
         seen = np.isfinite(found[:, 0])
         if seen.sum() < self.board.least_corners or _on_a_line(found[seen]):
             found[:] = np.nan
@@ -92,11 +89,8 @@ class BoardFinder:
     def _charuco(self) -> cv2.aruco.CharucoDetector:
         return cv2.aruco.CharucoDetector(self.board.opencv())
 
-    def _nothing(self) -> Float[np.ndarray, "corners 2"]:
-        return np.full((self.board.num_corners, 2), np.nan)
-
-    def _find_charuco(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
-        found, markers = self._nothing(), self.markers(grey)
+    def _find_charuco(self, grey: UInt8[np.ndarray, "height width"], found: _Corners) -> None:
+        markers = self.markers(grey)
         if len(markers):
             quads = [quad[None].astype(np.float32) for quad in markers.corners_px]
             corners, ids, _, _ = self._charuco.detectBoard(
@@ -104,14 +98,12 @@ class BoardFinder:
             )
             if ids is not None and len(ids):
                 found[np.asarray(ids).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2)
-        return found
 
-    def _find_grid(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
-        found, markers = self._nothing(), self.markers(grey)
+    def _find_grid(self, grey: UInt8[np.ndarray, "height width"], found: _Corners) -> None:
+        markers = self.markers(grey)
         found.reshape(-1, 4, 2)[markers.ids - self.board.first_marker] = markers.corners_px
-        return found
 
-    def _find_chessboard(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+    def _find_chessboard(self, image: UInt8[np.ndarray, "height width"], found: _Corners) -> None:
         columns, rows = self.board.squares_wh
         size = (columns - 1, rows - 1)
         # The search is slow in large images, and the corners are refined in the full image.
@@ -120,7 +112,7 @@ class BoardFinder:
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
         is_found, corners = cv2.findChessboardCornersSB(small, size, flags=flags)
         if not is_found:
-            return self._nothing()
+            return
         pixels = np.asarray(corners, np.float64).reshape(-1, 2)
         if scale > 1:
             # Pixel centres are at whole numbers.
@@ -129,7 +121,7 @@ class BoardFinder:
             half = _half_window(pixels.reshape(rows - 1, columns - 1, 2))
             criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-3)
             pixels = np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria), np.float64)
-        return _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
+        found[:] = _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
 
 
 def _half_window(grid: Float[np.ndarray, "rows columns 2"]) -> int:

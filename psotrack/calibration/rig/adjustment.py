@@ -247,10 +247,8 @@ def _first_lens(
 def _relabelled(board: Board, views: BoardViews, chain: Chain) -> BoardViews:
     """Put the corners of every view into the order of the board."""
     ordered = np.full(views.corners_px.shape, np.nan)
-    for camera, instant in np.ndindex(chain.labelling.shape):
-        order = board.labellings[chain.labelling[camera, instant]]
-        if views.seen[camera, instant]:
-            ordered[camera, instant, order] = views.corners_px[camera, instant]
+    seen_px = np.where(views.seen[..., None, None], views.corners_px, np.nan)
+    np.put_along_axis(ordered, board.labellings[chain.labelling][..., None], seen_px, axis=2)
     return replace(views, corners_px=ordered)
 
 

@@ -122,11 +122,6 @@ class FlightState:
     yaw_rad: float = 0.0
     turn_rad_s: float = 0.0
 
-    @classmethod
-    def hovering(cls, position_m: Vector) -> FlightState:
-        """State of a drone at rest that points along x."""
-        return cls(position_m, np.zeros(3), np.zeros(3))
-
 
 def step(state: FlightState, sticks: Sticks, space: Space, step_s: float) -> FlightState:
     """State after one step with constant stick positions."""
@@ -211,7 +206,8 @@ def fly(
         raise SettingsError("start", expected=f"a point from ({lower}) to ({upper})", found=f"({start})")
     per_record = int(np.ceil(_MIN_STEPS_HZ / rate_hz))
     step_s = 1 / (rate_hz * per_record)
-    state, sticks, done = FlightState.hovering(start_m), Sticks(), 0
+    # At rest, and pointing along x.
+    state, sticks, done = FlightState(start_m, np.zeros(3), np.zeros(3)), Sticks(), 0
     records: list[FlightState] = [state]
     used: list[Sample] = []
     for sample in samples:
