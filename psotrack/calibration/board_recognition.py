@@ -118,16 +118,13 @@ class BoardFinder:
             # Pixel centres are at whole numbers.
             pixels = (pixels + 0.5) * scale - 0.5
             start = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
-            half = _half_window(pixels.reshape(rows - 1, columns - 1, 2))
+            # Half the side of a window around a corner that contains no other corner.
+            grid = pixels.reshape(rows - 1, columns - 1, 2)
+            steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+            half = int(np.clip(min(steps) / 3, 2, 11))
             criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-3)
             pixels = np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria), np.float64)
         found[:] = _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
-
-
-def _half_window(grid: Float[np.ndarray, "rows columns 2"]) -> int:
-    """Half the side of a window around a corner that contains no other corner."""
-    steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
-    return int(np.clip(steps.min() / 3, 2, 11))
 
 
 def _in_order(

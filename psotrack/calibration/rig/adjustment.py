@@ -156,7 +156,11 @@ def calibrate_rig(
     start = lenses.start or start_lenses(board, views, lenses, report)
     models, vectors = zip(*(start[name] for name in views.names), strict=True)
     chain = join_cameras(board, views, models, vectors)
-    views = _relabelled(board, views, chain)
+    # The corners of every view in the order of the board.
+    seen_px = np.where(views.seen[..., None, None], views.corners_px, np.nan)
+    ordered = np.full(views.corners_px.shape, np.nan)
+    np.put_along_axis(ordered, board.labellings[chain.labelling][..., None], seen_px, axis=2)
+    views = replace(views, corners_px=ordered)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors), lenses, fixed, advance)
     found = _result(board, views, chain, models, bundle)
@@ -242,14 +246,6 @@ def _first_lens(
             remedy="tilt the board",
         )
     return model, vector
-
-
-def _relabelled(board: Board, views: BoardViews, chain: Chain) -> BoardViews:
-    """Put the corners of every view into the order of the board."""
-    ordered = np.full(views.corners_px.shape, np.nan)
-    seen_px = np.where(views.seen[..., None, None], views.corners_px, np.nan)
-    np.put_along_axis(ordered, board.labellings[chain.labelling][..., None], seen_px, axis=2)
-    return replace(views, corners_px=ordered)
 
 
 def _instant(views: BoardViews, number: int) -> int:

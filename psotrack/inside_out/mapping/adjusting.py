@@ -22,7 +22,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import GATE, Bundle, BundleProblem, BundleState, KnownLens, spread_px, summed
@@ -141,7 +141,11 @@ def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
     of consecutive views; its variance is that of the sums over neighbouring pairs, whose errors are alike (Liang &
     Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73(1), 1986).
     """
-    first = np.flatnonzero(_is_followed(sightings))
+    # Views that the next frame of the same video follows.
+    step_s = np.where(np.diff(sightings.lens) == 0, np.diff(sightings.time_s), np.inf)
+    least_s = np.full(len(sightings.lenses), np.inf)
+    np.minimum.at(least_s, sightings.lens[:-1], step_s)
+    first = np.flatnonzero(step_s < 1.5 * least_s[sightings.lens[:-1]])
     if len(first) < _FEWEST_PAIRS:
         return None
     height = np.array([float(lens.image_size_wh[1]) for lens in sightings.lenses])[bundle.problem.lens]
@@ -185,14 +189,6 @@ def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
             std[sightings.lens == video] = np.maximum(abs(ratio) * np.repeat(size, 3), _STILL)
             rolls = True
     return replace(moving, problem=replace(problem, motion_std=std)) if rolls else None
-
-
-def _is_followed(sightings: MarkerSightings) -> Bool[np.ndarray, " views"]:
-    """(views,), whether the next view is the next frame of the same video."""
-    step_s = np.where(np.diff(sightings.lens) == 0, np.diff(sightings.time_s), np.inf)
-    least_s = np.full(len(sightings.lenses), np.inf)
-    np.minimum.at(least_s, sightings.lens[:-1], step_s)
-    return np.append(step_s < 1.5 * least_s[sightings.lens[:-1]], False)
 
 
 def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarray, "markers 7 7"]:

@@ -27,7 +27,7 @@ from psotrack.simulation.flights.motion import quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s
 from psotrack.simulation.imaging import backdrop, raster, sensor
 from psotrack.simulation.imaging.floor import FloorLight, FloorShadows, Mirror, mirror
-from psotrack.simulation.imaging.lens_image import LensImage, LensStrips, Strip, lens_image, strips
+from psotrack.simulation.imaging.lens_image import LensImage, Strip, lens_image, show_strip, strips
 from psotrack.simulation.imaging.scenery import Scenery
 from psotrack.simulation.imaging.sensor import Image
 from psotrack.simulation.labels import Silhouette, lens_silhouettes, silhouettes
@@ -176,7 +176,8 @@ class OnboardRenderer:
         )
         stream = sensor.ONBOARD_STREAM + drone_index
         self.sensor = sensor.Sensor(imaging, scene.seed, stream, (self.height, self.width))
-        self._lens_strips = LensStrips(lens(scene))
+        camera = lens(scene)
+        self._lens: LensImage | None = lens_image(camera) if camera.dist.any() else None
         self._imaging = imaging
         self._floor = FloorLight(scene)
         self._painter = _room_painter(scene.scenario.hall, scene.scenario.markers, scene.scale)
@@ -228,7 +229,7 @@ class OnboardRenderer:
                 part[...] = (mixed + 0.5).astype(np.uint16)
             return light
 
-        return self._lens_strips.show(strip, self.cam_at(during_s), draw)
+        return show_strip(self._lens, strip, self.cam_at(during_s), draw)
 
     def _row_time_s(self, time_s: float, row: float) -> float:
         """When the middle of the exposure of a row is, for a frame whose middle row is exposed at `time_s`."""
@@ -271,7 +272,7 @@ class OnboardRenderer:
         seen = np.zeros(total.shape[:2], np.uint8)
         for strip in strips(self.height, row_px, 0, 1):
             cam = self.cam_at(self._row_time_s(time_s, strip.middle))
-            seen[strip.rows] = self._lens_strips.show(strip, cam, draw)
+            seen[strip.rows] = show_strip(self._lens, strip, cam, draw)
         # Above the horizon, a pixel's line meets the floor behind the camera; the floor's share is 0 at these pixels.
         x, y, width, height = cv2.boundingRect(seen)
         part = total[y : y + height, x : x + width]

@@ -10,12 +10,6 @@ Texture = Float[np.ndarray, "rows columns 3"]
 Bgr = tuple[float, float, float]
 
 
-def _cloud(shape: tuple[int, int], cells: int, rng: np.random.Generator) -> Float[np.ndarray, "rows columns"]:
-    """(rows, columns), smooth random stains, -1 to 1."""
-    coarse = rng.uniform(-1, 1, (max(2, shape[0] // cells), max(2, shape[1] // cells))).astype(np.float32)
-    return np.clip(cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC), -1, 1)
-
-
 def plain(width_m: float, height_m: float, texel_m: float, bgr: Bgr, rng: np.random.Generator) -> Texture:
     """Texture of one colour with stains of three sizes and fine grain."""
     # A separate random stream: the number of draws here depends on the texel size, and later draws must not.
@@ -23,7 +17,10 @@ def plain(width_m: float, height_m: float, texel_m: float, bgr: Bgr, rng: np.ran
     shape = (max(4, round(height_m / texel_m)), max(4, round(width_m / texel_m)))
     shade = 1 + 0.04 * rng.standard_normal(shape, np.float32)
     for size_m, strength in ((1.0, 0.06), (0.25, 0.05), (0.03, 0.06)):
-        shade += strength * _cloud(shape, max(2, round(size_m / texel_m)), rng)
+        cells = max(2, round(size_m / texel_m))
+        coarse = rng.uniform(-1, 1, [max(2, side // cells) for side in shape]).astype(np.float32)
+        stains = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)
+        shade += strength * np.clip(stains, -1, 1)
     texture = np.array(bgr, np.float32) * shade[..., None]
     return np.clip(texture, 0.01, 0.95, out=texture)
 
