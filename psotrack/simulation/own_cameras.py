@@ -319,7 +319,7 @@ def _draw_videos(work: _Work, advance: Advance) -> None:
     sensor = Sensor(scenario.imaging, scene.seed, _BOARD_STREAM + work.index, renderer.size_wh[::-1])
     with VideoWriter(work.folder / "board" / f"{one.name}.avi", BOARD_FPS, renderer.size_wh) as video:
         for number, board in enumerate(work.places):
-            views = [draw_board(view.empty_room(), view.cam, board) for view in renderer.views]
+            views = [draw_board(view.empty_room, view.cam, board) for view in renderer.views]
             video.write(sensor.expose(renderer.assemble(views), number, number / BOARD_FPS))
             advance(1)
     with VideoWriter(work.folder / one.flight, one.fps, renderer.size_wh) as video:

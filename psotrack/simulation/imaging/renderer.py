@@ -112,6 +112,9 @@ class View:
         cam: the camera.
         behind: what changes behind the drones, in the image of the lens.
         shows_px: (height, width, 2), column and row of the lens's image that each pixel shows; None: the same image.
+
+    Attributes:
+        empty_room: (height, width, 3), BGR image of the room without drones.
     """
 
     def __init__(
@@ -130,13 +133,13 @@ class View:
             self.mirror = mirror(scene.room, self.cam, imaging, self.backdrop)
             self.backdrop = self.mirror.on(self.backdrop)
         self.shadows = FloorShadows(scene, self.cam, self.backdrop, self.mirror)
-        self._clean: Image = sensor.develop(self.backdrop.light)
+        self.empty_room: Image = sensor.develop(self.backdrop.light)
         self._samples = raster.pass_samples(imaging)
         self._behind, self._shows_px = behind, shows_px
 
     def clean_frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame without the effects of the sensor."""
-        image = self._clean.copy()
+        image = self.empty_room.copy()
         imaging = self.scene.scenario.imaging
         time_s = self.scene.time_s(frame)
         self.shadows.cast(image, time_s)
@@ -153,10 +156,6 @@ class View:
             seen = raster.average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
             sensor.draw_over(image[window.slices], backdrop.lens_blur(seen, blur_px))
         return image
-
-    def empty_room(self) -> Image:
-        """(height, width, 3), BGR image of the room without drones."""
-        return self._clean.copy()
 
 
 class OnboardRenderer:
