@@ -22,8 +22,8 @@ from psotrack.foreground.markers import DetectedMarkers, MarkerDetector, marker_
 
 #: Largest standard deviation of corners from one line that is still a line, pixels.
 _LINE_PX = 1.5
-#: Largest size of an image in which OpenCV's search for a chessboard is fast, pixels.
-_CHESSBOARD_SIDE_PX = 1000
+#: Largest side of an image in which markers, and by OpenCV chessboards, are found quickly, pixels.
+_QUICK_SIDE_PX = 1000
 #: Number of views after which one pattern is certain, if it has three times as many views as the other.
 _CERTAIN = 6
 #: Number of images with most markers that are used to find out what a board is that was not found.
@@ -42,8 +42,6 @@ _MARKERS_OF_PLANE, _IMAGES_OF_SIZE = 5, 40
 _STILL_PX = 2.0
 #: Smallest number of images that show a marker of the board, as a fraction of those that show its most frequent marker.
 _OFTEN = 0.25
-#: Side of the images in which a board is recognised, pixels.
-_FIRST_SIDE_PX = 1000
 #: Largest number of squares along a side of a board that is recognised by its markers.
 _MOST_SQUARES = 20
 #: Largest distance, in sides of a square, up to which middles of markers fit a board, and a marker's side by default.
@@ -107,8 +105,7 @@ class BoardFinder:
         columns, rows = self.board.squares_wh
         size = (columns - 1, rows - 1)
         # The search is slow in large images, and the corners are refined in the full image.
-        scale = max(1, round(max(image.shape) / _CHESSBOARD_SIDE_PX))
-        small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        small, scale = _reduced(image)
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
         is_found, corners = cv2.findChessboardCornersSB(small, size, flags=flags)
         if not is_found:
@@ -188,7 +185,7 @@ def detect_board(square_m: float, images: _Images) -> Board:
     Raises:
         InputError: the images show neither, or a board whose squares cannot be counted.
     """
-    family, seen = _family_of_board(_small(images))
+    family, seen = _family_of_board([_reduced(grey)[0] for grey in images])
     if not family:
         return Board(_size_of_chessboard(images), square_m, None, kind="chessboard")
     clearest = sorted(_without_chance(seen), key=len, reverse=True)[:_IMAGES]
@@ -335,13 +332,10 @@ def _without_chance(seen: Sequence[_Markers]) -> list[_Markers]:
     return [{marker: quad for marker, quad in found.items() if times[marker] >= least} for found in seen]
 
 
-def _small(images: _Images) -> _Images:
-    """Images in which markers are found quickly."""
-    return [
-        cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-        for grey in images
-        for scale in [max(1, round(max(grey.shape) / _FIRST_SIDE_PX))]
-    ]
+def _reduced(grey: UInt8[np.ndarray, "height width"]) -> tuple[UInt8[np.ndarray, "_ _"], int]:
+    """An image in which markers and chessboards are found quickly, and by how much it is reduced."""
+    scale = max(1, round(max(grey.shape) / _QUICK_SIDE_PX))
+    return cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA), scale
 
 
 def _size_of_chessboard(images: _Images) -> tuple[int, int]:
@@ -352,8 +346,8 @@ def _size_of_chessboard(images: _Images) -> tuple[int, int]:
     """
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     shapes = Counter[tuple[int, int]]()
-    for grey in _small(images):
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    for grey in images:
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(_reduced(grey)[0], (3, 3), flags)
         if found:
             rows, columns = np.shape(meta)[:2]
             shapes[(max(rows, columns) + 1, min(rows, columns) + 1)] += 1
