@@ -22,8 +22,8 @@ from psotrack.foreground.markers import DetectedMarkers, MarkerDetector, marker_
 
 #: Largest standard deviation of corners from one line that is still a line, pixels.
 _LINE_PX = 1.5
-#: Largest size of an image in which OpenCV's search for a chessboard is fast, pixels.
-_CHESSBOARD_SIDE_PX = 1000
+#: Largest side of an image in which markers, and by OpenCV chessboards, are found quickly, pixels.
+_QUICK_SIDE_PX = 1000
 #: Number of views after which one pattern is certain, if it has three times as many views as the other.
 _CERTAIN = 6
 #: Number of images with most markers that are used to find out what a board is that was not found.
@@ -42,14 +42,13 @@ _MARKERS_OF_PLANE, _IMAGES_OF_SIZE = 5, 40
 _STILL_PX = 2.0
 #: Smallest number of images that show a marker of the board, as a fraction of those that show its most frequent marker.
 _OFTEN = 0.25
-#: Side of the images in which a board is recognised, pixels.
-_FIRST_SIDE_PX = 1000
 #: Largest number of squares along a side of a board that is recognised by its markers.
 _MOST_SQUARES = 20
 #: Largest distance, in sides of a square, up to which middles of markers fit a board, and a marker's side by default.
 _FITS, _USUAL_MARKER = 0.15, 0.75
 
 _Images = Sequence[UInt8[np.ndarray, "_ _"]]
+_Corners = Float[np.ndarray, "corners 2"]
 #: Markers of one family in an image: number of each and its corners, (4, 2), pixels.
 _Markers = dict[int, Float[np.ndarray, "4 2"]]
 
@@ -62,12 +61,8 @@ class BoardFinder:
 
     def find(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
         """Pixels of the board's corners, (corners, 2); NaN where a corner is not found, everywhere if few are."""
-        if self.board.kind == "chessboard":
-            found = self._find_chessboard(grey)
-        elif self.board.kind == "grid":
-            found = self._find_grid(grey)
-        else:
-            found = self._find_charuco(grey)
+        found = np.full((self.board.num_corners, 2), np.nan)
+        getattr(self, f"_find_{self.board.kind}")(grey, found)
         seen = np.isfinite(found[:, 0])
         if seen.sum() < self.board.least_corners or _on_a_line(found[seen]):
             found[:] = np.nan
@@ -92,11 +87,8 @@ class BoardFinder:
     def _charuco(self) -> cv2.aruco.CharucoDetector:
         return cv2.aruco.CharucoDetector(self.board.opencv())
 
-    def _nothing(self) -> Float[np.ndarray, "corners 2"]:
-        return np.full((self.board.num_corners, 2), np.nan)
-
-    def _find_charuco(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
-        found, markers = self._nothing(), self.markers(grey)
+    def _find_charuco(self, grey: UInt8[np.ndarray, "height width"], found: _Corners) -> None:
+        markers = self.markers(grey)
         if len(markers):
             quads = [quad[None].astype(np.float32) for quad in markers.corners_px]
             corners, ids, _, _ = self._charuco.detectBoard(
@@ -104,38 +96,32 @@ class BoardFinder:
             )
             if ids is not None and len(ids):
                 found[np.asarray(ids).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2)
-        return found
 
-    def _find_grid(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
-        found, markers = self._nothing(), self.markers(grey)
+    def _find_grid(self, grey: UInt8[np.ndarray, "height width"], found: _Corners) -> None:
+        markers = self.markers(grey)
         found.reshape(-1, 4, 2)[markers.ids - self.board.first_marker] = markers.corners_px
-        return found
 
-    def _find_chessboard(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+    def _find_chessboard(self, image: UInt8[np.ndarray, "height width"], found: _Corners) -> None:
         columns, rows = self.board.squares_wh
         size = (columns - 1, rows - 1)
         # The search is slow in large images, and the corners are refined in the full image.
-        scale = max(1, round(max(image.shape) / _CHESSBOARD_SIDE_PX))
-        small = cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        small, scale = _reduced(image)
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
         is_found, corners = cv2.findChessboardCornersSB(small, size, flags=flags)
         if not is_found:
-            return self._nothing()
+            return
         pixels = np.asarray(corners, np.float64).reshape(-1, 2)
         if scale > 1:
             # Pixel centres are at whole numbers.
             pixels = (pixels + 0.5) * scale - 0.5
             start = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
-            half = _half_window(pixels.reshape(rows - 1, columns - 1, 2))
+            # Half the side of a window around a corner that contains no other corner.
+            grid = pixels.reshape(rows - 1, columns - 1, 2)
+            steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+            half = int(np.clip(min(steps) / 3, 2, 11))
             criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-3)
             pixels = np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria), np.float64)
-        return _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
-
-
-def _half_window(grid: Float[np.ndarray, "rows columns 2"]) -> int:
-    """Half the side of a window around a corner that contains no other corner."""
-    steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
-    return int(np.clip(steps.min() / 3, 2, 11))
+        found[:] = _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
 
 
 def _in_order(
@@ -199,7 +185,7 @@ def detect_board(square_m: float, images: _Images) -> Board:
     Raises:
         InputError: the images show neither, or a board whose squares cannot be counted.
     """
-    family, seen = _family_of_board(_small(images))
+    family, seen = _family_of_board([_reduced(grey)[0] for grey in images])
     if not family:
         return Board(_size_of_chessboard(images), square_m, None, kind="chessboard")
     clearest = sorted(_without_chance(seen), key=len, reverse=True)[:_IMAGES]
@@ -346,13 +332,10 @@ def _without_chance(seen: Sequence[_Markers]) -> list[_Markers]:
     return [{marker: quad for marker, quad in found.items() if times[marker] >= least} for found in seen]
 
 
-def _small(images: _Images) -> _Images:
-    """Images in which markers are found quickly."""
-    return [
-        cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-        for grey in images
-        for scale in [max(1, round(max(grey.shape) / _FIRST_SIDE_PX))]
-    ]
+def _reduced(grey: UInt8[np.ndarray, "height width"]) -> tuple[UInt8[np.ndarray, "_ _"], int]:
+    """An image in which markers and chessboards are found quickly, and by how much it is reduced."""
+    scale = max(1, round(max(grey.shape) / _QUICK_SIDE_PX))
+    return cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA), scale
 
 
 def _size_of_chessboard(images: _Images) -> tuple[int, int]:
@@ -363,8 +346,8 @@ def _size_of_chessboard(images: _Images) -> tuple[int, int]:
     """
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
     shapes = Counter[tuple[int, int]]()
-    for grey in _small(images):
-        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    for grey in images:
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(_reduced(grey)[0], (3, 3), flags)
         if found:
             rows, columns = np.shape(meta)[:2]
             shapes[(max(rows, columns) + 1, min(rows, columns) + 1)] += 1

@@ -16,12 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import log
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
+from psotrack.calibration.lens_models import LensModel
 from psotrack.geometry import NEAR_M, Camera, cross_matrices, to_pixels_with_jacobian
 from psotrack.geometry.estimation import (
     NormalEquations,
@@ -59,23 +60,19 @@ def centre_by_pose(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> 
     return np.hstack([-R.T @ cross_matrices(t_m), -R.T])
 
 
-@runtime_checkable
-class Projection(Protocol):
-    """A lens as a vector of unknowns, which may be empty."""
-
-    def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels of points in the camera's axes, and their derivatives by the points and by the lens."""
-
-
 @dataclass(frozen=True)
 class KnownLens:
-    """A `Projection` of a lens that is known: its unknowns, if there are any, do not change it."""
+    """A lens that is known: its unknowns, if there are any, do not change it."""
 
     camera: Camera
 
     def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `Projection`."""
+        """As `LensModel.project`: pixels of points in the camera's axes, and derivatives by points and lens."""
         return *to_pixels_with_jacobian(self.camera, points_m), np.zeros((len(points_m), 2, len(lens)))
+
+
+#: A lens as a vector of unknowns, which may be empty.
+Projection = LensModel | KnownLens
 
 
 @dataclass(frozen=True)
@@ -296,24 +293,11 @@ class Bundle:
         by_target = [-by_world @ cross_matrices(arm), by_world]
         if problem.cameras_are_blocks:
             by_target.append(by_world @ arm[..., None])
-            by_shared, by_block = [by_lens, *by_target], by_camera
+            by_shared, by_block, is_free = [by_lens, *by_target], by_camera, problem.free_camera[:, None]
         else:
-            by_shared, by_block = [by_lens, *by_camera], by_target
-        return (
-            off,
-            np.concatenate(by_shared, axis=-1),
-            np.concatenate(by_block, axis=-1) * self._is_free_block,
-        )
-
-    @property
-    def _is_free_block(self) -> Float[np.ndarray, "sightings 1 1 *m"]:
-        """Whether the unknowns of a sighting's block are adjusted."""
-        free = (
-            self.problem.free_camera[:, None]
-            if self.problem.cameras_are_blocks
-            else self.problem.free_target[:, :6]
-        )
-        return free[self.problem.block, None, None].astype(np.float64)
+            by_shared, by_block, is_free = [by_lens, *by_camera], by_target, problem.free_target[:, :6]
+        of_block = np.concatenate(by_block, axis=-1) * is_free[problem.block, None, None]
+        return off, np.concatenate(by_shared, axis=-1), of_block
 
     @cached_property
     def distance_px(self) -> Float[np.ndarray, "sightings corners"]:

@@ -78,8 +78,9 @@ def solve_pnp(
     except cv2.error:
         # OpenCV fails for degenerate points, such as points on a line.
         return np.zeros((0, 4, 4))
-    poses = np.array([_pose(turn, shift) for turn, shift in zip(turns, shifts, strict=True)])
-    poses = poses.reshape(-1, 4, 4)
+    poses = np.tile(np.eye(4), (len(turns), 1, 1))
+    for T, turn, shift in zip(poses, turns, shifts, strict=True):
+        T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     distance = ray_distances(points_m, rays, poses)
     is_ahead = np.isfinite(distance).all(axis=1)
@@ -165,12 +166,6 @@ def _flattened(points_m: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "po
     return points_m - (centred_m @ normal)[:, None] * normal
 
 
-def _pose(turn: np.ndarray, shift: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    return T
-
-
 @dataclass(frozen=True)
 class Located:
     """A camera's pose and its covariance.
@@ -215,20 +210,21 @@ def locate_camera(
         name: name of the camera in error messages.
 
     Raises:
-        InputError: there are too few points, the points are on one line, two poses fit equally well, the points' axes
-            are mirrored, or no pose fits.
+        InputError: there are too few points, the points are on one line, two poses fit equally well, or
+            no pose fits.
         SettingsError: `noise_px` is not above 0.
     """
     check_positive("noise_px", noise_px)
-    extent_m = _check_points(points_m, points_px, name)
+    _check_points(points_m, points_px, name)
     fits = _likely_poses(points_m, points_px, lens, noise_px)
     typical_px = _typical_px(fits[0]) if fits else np.inf
     if typical_px > _MAX_MEDIAN_SIGMAS * noise_px:
-        mirrored_m = points_m * np.array([1.0, 1.0, -1.0])
-        is_flat = extent_m[2] <= _FLAT * extent_m[0]
-        twins = [] if is_flat else _likely_poses(mirrored_m, points_px, lens, noise_px)
-        is_mirrored = any(_typical_px(twin) < 0.2 * typical_px for twin in twins[:1])
-        raise _no_pose(typical_px, noise_px, name, is_mirrored=is_mirrored)
+        raise InputError(
+            name,
+            expected=f"a pose that most points fit to about {noise_px:g} px",
+            found="none" if np.isinf(typical_px) else f"a median distance of {typical_px:.0f} px",
+            remedy="check for mirrored axes, for points that are mixed up, and for the lens of another camera",
+        )
     _check_unique(fits, name)
     fit = fits[0]
     # The gate depends on the fit and the fit on the gate. The number of rounds is limited in case they oscillate.
@@ -333,8 +329,7 @@ def _typical_px(fit: Bundle) -> float:
 
 def _check_points(
     points_m: Float[np.ndarray, "points 3"], points_px: Float[np.ndarray, "points 2"], name: str
-) -> Float[np.ndarray, "3"]:
-    """The extents of the points along their principal axes, largest first."""
+) -> None:
     if len(points_m) != len(points_px) or len(points_m) < MIN_POINTS:
         raise InputError(
             name, expected=f"at least {MIN_POINTS} points of known position", found=f"{len(points_m)}"
@@ -349,7 +344,6 @@ def _check_points(
             found=f"{len(points_m)} points on one line",
             remedy="mark points beside this line",
         )
-    return extent_m
 
 
 def _check_unique(fits: list[Bundle], name: str) -> None:
@@ -363,20 +357,3 @@ def _check_unique(fits: list[Bundle], name: str) -> None:
                 found=f"two poses, {np.linalg.norm(first - second):.2g} m apart, that fit equally well",
                 remedy="mark more points that are not in the plane of the others",
             )
-
-
-def _no_pose(typical_px: float, noise_px: float, name: str, *, is_mirrored: bool) -> InputError:
-    """Error of points that no pose fits, which names the cause if it is a mirrored world."""
-    if is_mirrored:
-        return InputError(
-            name,
-            expected="points in right-handed axes",
-            found="points that fit a mirrored world",
-            remedy="reverse the axis that has the wrong sign, or swap back two axes",
-        )
-    return InputError(
-        name,
-        expected=f"a pose that most points fit to about {noise_px:g} px",
-        found="none" if np.isinf(typical_px) else f"a median distance of {typical_px:.0f} px",
-        remedy="check for points that are mixed up, and for the lens of another camera",
-    )

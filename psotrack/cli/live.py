@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import click
 from msgspec import Meta
 
-from psotrack import pipeline, recordings, support, trajectories
+from psotrack import pipeline, support, trajectories
 from psotrack.cli.commands import command
 from psotrack.cli.options import Cache, Cameras, MostDrones, Seq, compiled_folder, recording_named
 from psotrack.cli.output import Output, check_suffix
@@ -108,7 +108,9 @@ def live(
         check_suffix("--out", out, ".csv")
         output.refuse(out, out.with_suffix(".json"))
     if view is not None:
-        _check_viewer(view)
+        viewer.check_installed()
+        if view == "window":
+            viewer.check_display()
     support.start_server("psotrack.live.front_end")
     tracking = TrackSettings().changed(settings)
     support.keep_compiled(compiled_folder(cache))
@@ -149,8 +151,12 @@ def live(
             outputs.append(server.write)
             if not output.quiet:
                 click.echo(f"rows are sent to clients of {server.address}", err=True)
-        shown = None if view is None else stack.enter_context(_open_view(view, recording, hidden))
-        outputs += [] if shown is None else [shown.write]
+        shown = None
+        if view is not None:
+            shown = stack.enter_context(viewer.LiveView(recording, web=view == "web"))
+            outputs.append(shown.write)
+            if shown.page:
+                click.echo(shown.page, err=hidden)
         console, changed_s = Console(stderr=True), 0.0
         table = None
         if console.is_terminal and not hidden:
@@ -186,20 +192,6 @@ def live(
     # Said before, while the other outputs went on.
     if result.failed_outputs:
         raise result.failed_outputs[0]
-
-
-def _check_viewer(view: str) -> None:
-    viewer.check_installed()
-    if view == "window":
-        viewer.check_display()
-
-
-@contextlib.contextmanager
-def _open_view(chosen: str, recording: recordings.Recording, quiet: bool) -> Iterator[viewer.LiveView]:
-    with viewer.LiveView(recording, web=chosen == "web") as view:
-        if view.page:
-            click.echo(view.page, err=quiet)
-        yield view
 
 
 def _record(result: LiveResult) -> dict[str, Any]:

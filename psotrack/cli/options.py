@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from psotrack import recordings
 from psotrack.cli.output import Output
-from psotrack.cli.types import RUNNING, SequencePath, says
+from psotrack.cli.types import RUNNING, SequencePath, archive_of, says
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import datasets
 from psotrack.settings import BLOBS, YOLO
@@ -135,9 +135,7 @@ def compiled_folder(chosen: str | Path | None) -> Path:
 
 def beside(sequence: Path, name: str) -> Path:
     """Default of `--out`: `name` in the folder `results` of a recording, or beside an archive."""
-    from psotrack.cli.settings import archive_of
-
-    archive = archive_of(click.get_current_context())
+    archive = archive_of()
     if archive is not None:
         return archive.path.with_suffix("") / name
     return (sequence if sequence.is_dir() else sequence.parent) / "results" / name
@@ -170,10 +168,4 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
 
 def recording_named(sequence: Path, tracks: Path) -> str:
     """How the record beside tracks names their recording; empty for an archive, whose content is gone afterwards."""
-    from psotrack.cli.settings import archive_of
-
-    return (
-        ""
-        if archive_of(click.get_current_context()) is not None
-        else flights.recording_beside(sequence, tracks)
-    )
+    return "" if archive_of() is not None else flights.recording_beside(sequence, tracks)

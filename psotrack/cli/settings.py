@@ -18,14 +18,11 @@ import msgspec
 from psotrack import __version__
 from psotrack.cli.commands import Field, OptionGroup, fields_of, is_given, option_of
 from psotrack.cli.output import check_suffix
-from psotrack.cli.types import says
+from psotrack.cli.types import ARCHIVE, archive_of, says
 from psotrack.errors import InputError, SettingsError
 from psotrack.pipeline import archives
 from psotrack.settings import TrackSettings, flatten
 from psotrack.support import atomic_write, read_toml, refuse_files, toml_value
-
-#: Key of the archive in the context of a command.
-_ARCHIVE = "psotrack.archive"
 
 
 @dataclass(frozen=True)
@@ -77,23 +74,17 @@ def opened_archive(context: click.Context, path: Path) -> Path:
     # `unpack` refuses names that lead elsewhere, but this name is no path of the archive.
     name = Path(manifest.sequence).name or "archive"
     folder = (temporary / "archive").rename(temporary / name)
-    context.meta[_ARCHIVE] = OpenedArchive(path, folder, archives.read_manifest(folder))
+    context.meta[ARCHIVE] = OpenedArchive(path, folder, archives.read_manifest(folder))
     return folder
-
-
-def archive_of(context: click.Context) -> OpenedArchive | None:
-    """The archive that the command was given as SEQ; None for any other recording."""
-    return context.meta.get(_ARCHIVE)
 
 
 def chosen_extent(num_frames: int | None, causal: bool, most_drones: int) -> tuple[int | None, bool, int]:
     """The values of --frames, --causal and --most-drones: those of an archive where the user chose none."""
-    context = click.get_current_context()
-    archive = archive_of(context)
+    archive = archive_of()
     if archive is None:
         return num_frames, causal, most_drones
     packed = archive.manifest
-    if packed.most_drones is not None and not is_given(context, "most_drones"):
+    if packed.most_drones is not None and not is_given(click.get_current_context(), "most_drones"):
         most_drones = packed.most_drones
     return num_frames or packed.frames, causal or packed.causal, most_drones
 
@@ -114,10 +105,9 @@ def with_comparison(
     Raises:
         InputError: a file of the archive cannot be read.
     """
-    archive = archive_of(click.get_current_context())
+    archive = archive_of()
     if archive is None:
         return record, ""
-
     asked = archive.without_place(settings)
     comparison = archives.compare_with_archive(archive.folder, archive.manifest, tracks, record, asked)
     of_archive = {"file": archive.path.name, **comparison.to_dict()}
@@ -235,5 +225,5 @@ def chosen_settings(chosen: Mapping[str, Any]) -> TrackSettings:
         InputError: the archive has settings that this version does not know.
         SettingsError: a name is unknown, or a value is not allowed.
     """
-    archive = archive_of(click.get_current_context())
+    archive = archive_of()
     return (TrackSettings() if archive is None else archive.settings).changed(chosen)

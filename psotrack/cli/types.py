@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from msgspec import Meta
 
 from psotrack.support import ARCHIVE_SUFFIX, whole_number
 
+if TYPE_CHECKING:
+    from psotrack.cli.settings import OpenedArchive
+
+#: Key of the archive in the context of a command.
+ARCHIVE = "psotrack.archive"
 #: Heading of the options that are not about the work itself.
 RUNNING = "Running"
 
@@ -107,3 +112,8 @@ def opened_sequence(path: Path) -> Path:
     from psotrack.cli.settings import opened_archive
 
     return opened_archive(click.get_current_context(), path)
+
+
+def archive_of() -> OpenedArchive | None:
+    """The archive that the command was given as SEQ; None for any other recording."""
+    return click.get_current_context().meta.get(ARCHIVE)

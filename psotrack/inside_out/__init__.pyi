@@ -1,6 +1,6 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .filtering import PoseFilterParams, smooth
-from .frames import FrameSource, markers_of_images, markers_of_video, open_source, write_marker_table
+from .frames import FrameSource, markers_of, open_source, write_marker_table
 from .fusing import FusedTracks, fuse, write_fused
 from .lens_files import choose_lens, lens_from_matrix
 from .localising import LocalisedVideo, LocaliseSettings, localise_video
@@ -49,8 +49,7 @@ __all__ = [
     "fuse",
     "lens_from_matrix",
     "localise_video",
-    "markers_of_images",
-    "markers_of_video",
+    "markers_of",
     "open_source",
     "read_camera_path",
     "read_marker_map",

@@ -21,7 +21,7 @@ from concurrent.futures import TimeoutError as NotYetError
 from dataclasses import dataclass, replace
 from itertools import count, islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -293,36 +293,27 @@ def map_ahead(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def markers_of_images(
-    paths: Sequence[Path], dictionary: str, report: Report = no_progress
+def markers_of(
+    source: FrameSource | Sequence[Path], dictionary: str, report: Report = no_progress
 ) -> Iterator[DetectedMarkers]:
-    """Markers of photographs, which may differ in size, one after the other; the search is thorough.
+    """Markers of a video's frames, or of photographs, which may differ in size and are searched thoroughly, in turn.
 
     Raises:
-        InputError: a file is no image.
+        InputError: a file is no image, the video ends early, or a frame has another size.
         SettingsError: there is no dictionary of this name.
     """
-    return _markers(MarkerDetector(dictionary, thorough=True), read_grey, iter(paths), len(paths), report)
+    items: Iterator[Frame | Path]
+    if isinstance(source, FrameSource):
+        items, count = read_ahead(source.frames()), source.num_frames or 0
+    else:
+        items, count = iter(source), len(source)
+    detector = MarkerDetector(dictionary, thorough=not isinstance(source, FrameSource))
 
+    def found(item: Frame | Path) -> DetectedMarkers:
+        return detector.detect(item.grey() if isinstance(item, Frame) else read_grey(item))
 
-def markers_of_video(
-    source: FrameSource, dictionary: str, report: Report = no_progress
-) -> Iterator[DetectedMarkers]:
-    """Markers of a video's frames, one after the other.
-
-    Raises:
-        InputError: the video ends early, or a frame has another size.
-        SettingsError: there is no dictionary of this name.
-    """
-    frames = read_ahead(source.frames())
-    return _markers(MarkerDetector(dictionary), Frame.grey, frames, source.num_frames or 0, report)
-
-
-def _markers(
-    detector: MarkerDetector, grey_of: Callable[[Any], Any], items: Iterator[Any], count: int, report: Report
-) -> Iterator[DetectedMarkers]:
     with report("markers", count) as advance:
-        for markers in map_ahead(lambda item: detector.detect(grey_of(item)), items, _WORKERS):
+        for markers in map_ahead(found, items, _WORKERS):
             advance(1)
             yield markers
 

@@ -20,7 +20,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import in_images
 from psotrack.pipeline.inputs import Run
 from psotrack.settings import BLOBS, DroneSettings, TrackSettings, flatten
-from psotrack.support import html_block, html_lines, identify
+from psotrack.support import evenly_spread, html_block, html_lines, identify
 from psotrack.tracking.births import (
     BirthRules,
     count_common,
@@ -231,8 +231,7 @@ def _explained(run: Run, tracks: Tracks) -> dict[str, Any]:
     rig, cameras = run.recording.rig, run.recording.rig.cameras
     tracked = np.asarray(tracks.status == Status.TRACKED)
     frames = np.flatnonzero(tracked.any(axis=1))
-    spread = np.linspace(0, len(frames) - 1, min(len(frames), _COUNTED_FRAMES)).round().astype(int)
-    frames = frames[spread]
+    frames = frames[evenly_spread(len(frames), _COUNTED_FRAMES)]
     if run.sightings is not None:
         sightings = run.sightings[frames]
     else:

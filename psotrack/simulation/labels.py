@@ -204,7 +204,12 @@ def detect(scene: Scene, camera_index: int, frame: int, seen: Sequence[Silhouett
     for _ in range(rng.poisson(settings.false_alarms_per_frame)):
         boxes.append(_false_alarm(rng, targets, size_wh))
         confidences.append(_confidence(rng, 0.0))
-    return _clip_to_image(frame, np.array(boxes).reshape(-1, 4), np.array(confidences), size_wh)
+    # Boxes are clipped to the image, and those that are less than a pixel wide or high left out.
+    xyxy = np.clip(np.array(boxes).reshape(-1, 4), 0.0, np.tile(size_wh, 2)).round(2)
+    confidence = np.array(confidences)
+    kept = np.flatnonzero(((xyxy[:, 2:] - xyxy[:, :2]) >= 1.0).all(axis=1))
+    kept = kept[np.argsort(-confidence[kept], kind="stable")]
+    return Detections(np.full(len(kept), frame), xyxy[kept], confidence[kept].round(4))
 
 
 def iou(a: Box, b: Box) -> float:
@@ -272,16 +277,3 @@ def _confidence(rng: np.random.Generator, quality: float) -> float:
     mean = low + (high - low) * quality
     share = rng.beta(_BETA_SUM * mean, _BETA_SUM * (1 - mean))
     return _LEAST_CONFIDENCE + (1 - _LEAST_CONFIDENCE) * share
-
-
-def _clip_to_image(
-    frame: int,
-    xyxy: Float[np.ndarray, "boxes 4"],
-    confidence: Float[np.ndarray, "boxes"],
-    size_wh: Float[np.ndarray, "2"],
-) -> Detections:
-    """Detections with boxes clipped to the image, without boxes that are less than a pixel wide or high."""
-    xyxy = np.clip(xyxy, 0.0, np.tile(size_wh, 2)).round(2)
-    kept = np.flatnonzero(((xyxy[:, 2:] - xyxy[:, :2]) >= 1.0).all(axis=1))
-    kept = kept[np.argsort(-confidence[kept], kind="stable")]
-    return Detections(np.full(len(kept), frame), xyxy[kept], confidence[kept].round(4))

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack import __version__
-from psotrack.calibration import Board
+from psotrack.calibration import Board, Similarity
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, undistort
 from psotrack.geometry.rig_files import write_rig
@@ -319,7 +319,7 @@ def _draw_videos(work: _Work, advance: Advance) -> None:
     sensor = Sensor(scenario.imaging, scene.seed, _BOARD_STREAM + work.index, renderer.size_wh[::-1])
     with VideoWriter(work.folder / "board" / f"{one.name}.avi", BOARD_FPS, renderer.size_wh) as video:
         for number, board in enumerate(work.places):
-            views = [draw_board(view.empty_room(), view.cam, board) for view in renderer.views]
+            views = [draw_board(view.empty_room, view.cam, board) for view in renderer.views]
             video.write(sensor.expose(renderer.assemble(views), number, number / BOARD_FPS))
             advance(1)
     with VideoWriter(work.folder / one.flight, one.fps, renderer.size_wh) as video:
@@ -340,16 +340,9 @@ def _write_tables(folder: Path, scene: Scene, rig: Rig, floor: PosedBoard, durat
         orientation_wxyz=np.stack([flight.orientation_wxyz(times) for flight in scene.flights], axis=1),
     )
     write_tum(folder, trajectories)
-    write_rig(folder / "truth" / "rig.toml", moved(rig, origin_m))
+    write_rig(folder / "truth" / "rig.toml", Similarity(np.eye(3), -origin_m).rig(rig))
     rows = [[one.name, one.flight, one.fps, one.start_s] for one in OWN_CAMERAS]
     write_rows(folder / "truth" / "clocks.csv", [["camera", "video", "fps", "start_s"], *rows], separator=",")
-
-
-def moved(rig: Rig, origin_m: Point) -> Rig:
-    """The rig in a world with another origin and the same axes."""
-    T = np.array(rig.cameras.T_cam_world)
-    T[:, :3, 3] += T[:, :3, :3] @ origin_m
-    return Rig(rig.names, replace(rig.cameras, T_cam_world=T))
 
 
 def _write_record(folder: Path, scene: Scene, num_frames: int) -> None:

@@ -1,4 +1,4 @@
-from .array_checks import first_repeat, first_repeated, first_true, has_negative_eigenvalue
+from .array_checks import evenly_spread, first_repeat, first_repeated, first_true, has_negative_eigenvalue
 from .calls import check_records, checked
 from .compiled import (
     Device,
@@ -134,6 +134,7 @@ __all__ = [
     "drone_colour",
     "drop_programs_if_many",
     "end_of_links",
+    "evenly_spread",
     "finite_or_none",
     "first_line",
     "first_repeat",

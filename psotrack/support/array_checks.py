@@ -1,4 +1,4 @@
-"""Which rows of arrays that come from files of others are wrong."""
+"""Rows of arrays: those from files of others that are wrong, and a few of many, evenly spread."""
 
 from __future__ import annotations
 
@@ -44,3 +44,8 @@ def has_negative_eigenvalue(covariance: Float[np.ndarray, "*rows n n"]) -> Bool[
     known = ~np.isnan(covariance).any(axis=(-2, -1))
     eigenvalues = np.linalg.eigvalsh(np.where(known[..., None, None], covariance, 0.0))
     return eigenvalues[..., 0] < -_ROUNDING * np.abs(eigenvalues).max(axis=-1)
+
+
+def evenly_spread(count: int, most: int) -> Int[np.ndarray, " chosen"]:
+    """(chosen,), indices of at most `most` of `count` things, evenly spread from the first to the last one."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int)

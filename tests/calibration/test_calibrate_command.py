@@ -454,7 +454,7 @@ BAD = {
     "no lens of it": (pairs("c1,p3,", "c9,p3,"), "lenses.toml: expected the lens of c9, found only c0, c1"),
     "three points": (located(POINTS_M[:3], PIXELS[:3], CAMERA), "camera c7", "known position, found 3"),
     "a line": (located(LINE_M, LINE_PX, CAMERA), "camera c7", "not all on one line"),
-    "mirrored": (located(POINTS_M * [1, -1, 1], PIXELS, CAMERA), "right-handed axes", "mirrored"),
+    "mirrored": (located(POINTS_M * [1, -1, 1], PIXELS, CAMERA), "camera c7", "check for mirrored axes"),
     "mixed up": (located(POINTS_M, PIXELS[RNG.permutation(12)], CAMERA), "camera c7", "mixed up"),
     "small plane": (located(SHEET_M, SHEET_PX, SHEET_CAMERA), "camera c7", "two poses"),
     # Boards and their views.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -304,23 +304,7 @@ def estimate_clocks(
         points_px: (instants, drones, cameras, 2), matched sightings at the instants (see `places_of_tracks`).
         timeline: the instants.
     """
-    stretches = _offsets_of_stretches(rig, points_px, timeline, _LEAST_INSTANTS)
-    return fit_clocks(*stretches, known_s=_KNOWN / timeline.rate_hz)
-
-
-class _Stretches(NamedTuple):
-    """Middle of each stretch, offsets of the cameras in it and their standard deviations, seconds."""
-
-    time_s: Float[np.ndarray, "stretches"]
-    offset_s: Float[np.ndarray, "stretches cameras"]
-    std_s: Float[np.ndarray, "stretches cameras"]
-
-
-def _offsets_of_stretches(
-    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline, least: int
-) -> _Stretches:
-    """Constant offsets in each of several stretches, each of at least `least` instants."""
-    num_stretches = int(np.clip(len(points_px) // least, 1, _MOST_STRETCHES))
+    num_stretches = int(np.clip(len(points_px) // _LEAST_INSTANTS, 1, _MOST_STRETCHES))
     parts = np.array_split(np.arange(len(points_px)), num_stretches)
     estimates = [
         camera_offsets(rig, points_px[part], timeline.rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
@@ -334,7 +318,7 @@ def _offsets_of_stretches(
     larger = np.sqrt(max(float(np.mean((std / white)[shown] ** 2)), 1.0)) if shown.any() else 1.0
     std_s = np.where(shown, larger * (white / timeline.rate_hz), np.inf)
     time_s = np.array([timeline.time_s[part].mean() for part in parts])
-    return _Stretches(time_s, offset / timeline.rate_hz, std_s)
+    return fit_clocks(time_s, offset / timeline.rate_hz, std_s, known_s=_KNOWN / timeline.rate_hz)
 
 
 def _as_exposed(
@@ -371,35 +355,30 @@ def fit_clocks(
     num_stretches, num_cameras = offset_s.shape
     middle_s = float(time_s.mean())
     even = np.ones(num_stretches)
-    used = _fit(even[:, None], offset_s, std_s)
+    fitted, std = _fit(even[:, None], offset_s, std_s)
     drift, drift_std = np.zeros(num_cameras), np.full(num_cameras, np.inf)
     if num_stretches >= 3:
-        line = _fit(np.stack([even, time_s - middle_s], axis=-1), offset_s, std_s)
-        found, drift_std = line.coefficients[:, 1] - np.median(line.coefficients[:, 1]), line.std[:, 1]
+        line, line_std = _fit(np.stack([even, time_s - middle_s], axis=-1), offset_s, std_s)
+        found, drift_std = line[:, 1] - np.median(line[:, 1]), line_std[:, 1]
         if (np.abs(found) > _CLEARLY * drift_std).any():
-            drift, used = found, line
+            drift, fitted, std = found, line, line_std
     seen = np.isfinite(std_s).any(axis=0)
-    offset_std_s = np.where(seen, used.std[:, 0], np.inf)
-    known, fitted_s = offset_std_s < known_s, used.coefficients[:, 0]
+    offset_std_s = np.where(seen, std[:, 0], np.inf)
+    known, fitted_s = offset_std_s < known_s, fitted[:, 0]
     zero_s = float(np.median(fitted_s[known])) if known.any() else 0.0
     offset_s = np.where(known, fitted_s - zero_s, 0.0)
     return CameraClocks(offset_s, offset_std_s, np.where(known, drift, 0.0), drift_std, middle_s, known)
-
-
-class _Fit(NamedTuple):
-    """Coefficients of each camera, relative to the mean of all, standard deviations, and the scatter about them."""
-
-    coefficients: Float[np.ndarray, "cameras terms"]
-    std: Float[np.ndarray, "cameras terms"]
-    scatter: float
 
 
 def _fit(
     basis: Float[np.ndarray, "stretches terms"],
     offset_s: Float[np.ndarray, "stretches cameras"],
     std_s: Float[np.ndarray, "stretches cameras"],
-) -> _Fit:
-    """Weighted least squares; where the offsets scatter more than their errors say, the covariance is larger."""
+) -> tuple[Float[np.ndarray, "cameras terms"], Float[np.ndarray, "cameras terms"]]:
+    """Coefficients of each camera, relative to the mean of all, and standard deviations, by weighted least squares.
+
+    Where the offsets scatter more than their errors say, the covariance is larger.
+    """
     (num_stretches, terms), num_cameras = basis.shape, offset_s.shape[1]
     unknowns = num_cameras * terms
     weight = 1 / np.maximum(std_s, 1e-9).ravel()
@@ -420,4 +399,4 @@ def _fit(
     centred = np.kron(np.eye(num_cameras) - share, np.eye(terms))
     coefficients = solution[:unknowns].reshape(num_cameras, terms)
     std = np.sqrt(np.diag(centred @ covariance @ centred.T)).reshape(num_cameras, terms)
-    return _Fit(coefficients - share @ coefficients, std, scatter)
+    return coefficients - share @ coefficients, std

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -114,14 +114,10 @@ def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
     numbers = "" if of_lenses else f", which moves its boxes by {fault.shift_px:.0f} px"
     if also:
         numbers += f"; nearly as likely, {' or '.join(said for said, _ in also)}"
-    kind, *others = (_named(one.hypothesis.kind) for one in every)
+    # A camera that is turned and moved was moved, for programs.
+    kind, *others = (one.hypothesis.kind.removeprefix("turned and ") for one in every)
     other_kinds = tuple(other for other in dict.fromkeys(others) if other != kind)
     return Finding(kind, names, f"{_who(rig, fault.best)}: {words}{numbers}", remedy, other_kinds)
-
-
-def _named(kind: str) -> str:
-    """The kind for programs: a camera that is turned and moved was moved."""
-    return "moved" if kind == "turned and moved" else kind
 
 
 def _who(rig: Rig, judged: Judged) -> str:
@@ -238,14 +234,7 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """The findings and measurements, with None for missing numbers."""
         return {
-            "findings": [
-                {
-                    **vars(finding),
-                    "cameras": list(finding.cameras),
-                    "nearly_as_likely": list(finding.nearly_as_likely),
-                }
-                for finding in self.findings
-            ],
+            "findings": [asdict(finding) for finding in self.findings],
             "frames": self.num_frames,
             "explained": float(self.num_explained.sum() / max(self.num_sightings.sum(), 1)),
             "cameras": self._measured(),

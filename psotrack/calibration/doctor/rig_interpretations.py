@@ -67,8 +67,9 @@ def _conventions(rig: Rig) -> Iterator[RigInterpretation]:
         # z if this brings the cameras above the floor, else x.
         world = np.ones(3)
         world[2 if np.matvec(R.swapaxes(-1, -2), t_m)[:, 2].mean() > 0 else 0] = np.prod(flip)
-        cameras = _posed(rig.cameras, flip[:, None] * R * world, flip * t_m)
-        yield _convention(rig, cameras, centred, turned, flip)
+        changed = T.copy()
+        changed[:, :3, :3], changed[:, :3, 3] = flip[:, None] * R * world, flip * t_m
+        yield _convention(rig, replace(rig.cameras, T_cam_world=changed), centred, turned, flip)
 
 
 def _convention(
@@ -147,9 +148,3 @@ def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterp
             (),
             Rig(rig.names, replace(rig.cameras, K=K)),
         )
-
-
-def _posed(cameras: Camera, R: Float[np.ndarray, "n 3 3"], t_m: Float[np.ndarray, "n 3"]) -> Camera:
-    T = cameras.T_cam_world.copy()
-    T[:, :3, :3], T[:, :3, 3] = R, t_m
-    return replace(cameras, T_cam_world=T)

@@ -106,6 +106,14 @@ class CalibratedRig:
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
     shared: Int[np.ndarray, "cameras cameras"]
 
+    @property
+    def view_px(self) -> Float[np.ndarray, "cameras instants"]:
+        """(cameras, instants), median distance of a view's corners, pixels; NaN of a camera that does not see it."""
+        seen = ~np.isnan(self.residual_px).all(axis=-1)
+        medians = np.full(seen.shape, np.nan)
+        medians[seen] = np.nanmedian(self.residual_px[seen], axis=-1)
+        return medians
+
 
 @dataclass(frozen=True)
 class LensChoice:
@@ -148,7 +156,11 @@ def calibrate_rig(
     start = lenses.start or start_lenses(board, views, lenses, report)
     models, vectors = zip(*(start[name] for name in views.names), strict=True)
     chain = join_cameras(board, views, models, vectors)
-    views = _relabelled(board, views, chain)
+    # The corners of every view in the order of the board.
+    seen_px = np.where(views.seen[..., None, None], views.corners_px, np.nan)
+    ordered = np.full(views.corners_px.shape, np.nan)
+    np.put_along_axis(ordered, board.labellings[chain.labelling][..., None], seen_px, axis=2)
+    views = replace(views, corners_px=ordered)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors), lenses, fixed, advance)
     found = _result(board, views, chain, models, bundle)
@@ -234,16 +246,6 @@ def _first_lens(
             remedy="tilt the board",
         )
     return model, vector
-
-
-def _relabelled(board: Board, views: BoardViews, chain: Chain) -> BoardViews:
-    """Put the corners of every view into the order of the board."""
-    ordered = np.full(views.corners_px.shape, np.nan)
-    for camera, instant in np.ndindex(chain.labelling.shape):
-        order = board.labellings[chain.labelling[camera, instant]]
-        if views.seen[camera, instant]:
-            ordered[camera, instant, order] = views.corners_px[camera, instant]
-    return replace(views, corners_px=ordered)
 
 
 def _instant(views: BoardViews, number: int) -> int:

@@ -26,7 +26,7 @@ from psotrack.calibration.rig.moving_point import (
     covariance_of_centres,
 )
 from psotrack.calibration.rig.settings import RigSettings
-from psotrack.calibration.rig.shifts import find_board_shifts, find_point_shifts
+from psotrack.calibration.rig.shifts import find_board_shifts
 from psotrack.calibration.rig.views import CameraImages, FoundBoards, Instants
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
@@ -59,11 +59,7 @@ def calibrate_by_board(
         SettingsError: the settings do not say what the board is like, or do not fit the sources.
     """
     given = None if settings.world is None else point_files.read_world(settings.world)
-    if len(sources) == 1 and is_recording(sources[0]):
-        cameras, instants = board_views.open_recorded(open_recording(sources[0]))
-    else:
-        cameras = board_views.open_images(sources, settings.names)
-        instants = board_views.instants_of_numbers(cameras)
+    cameras, instants = _open(sources, settings)
     lenses, said = _lens_choice(settings, cameras), []
     if settings.squares is None:
         stated = detect_board(settings.square_m or 0.0, board_views.first_images(cameras, 4))
@@ -87,6 +83,14 @@ def calibrate_by_board(
         place = f"camera {first}: x right, y down, z forward; --floor and --world place it elsewhere"
     begins = {name: -shift for name, shift in zip(found.views.names, shifts, strict=True)}
     return findings.result_of_board(calibrated, said, findings.say_print(found), place, begins)
+
+
+def _open(sources: Sequence[Path], settings: RigSettings) -> tuple[tuple[CameraImages, ...], Instants]:
+    """Images of a recording's cameras, or of each path, and which of them belong to one instant."""
+    if len(sources) == 1 and is_recording(sources[0]):
+        return board_views.open_recorded(open_recording(sources[0]))
+    cameras = board_views.open_images(sources, settings.names)
+    return cameras, board_views.instants_of_numbers(cameras)
 
 
 def _find_views(
@@ -157,7 +161,7 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     def world_of(found: PointRig) -> tuple[Similarity, str]:
         rig = found.rig
         if given is not None:
-            change, left_m = point_files.fit_world(rig, given, _numbered(found), with_scale=True)
+            change, left_m = point_files.fit_world(rig, given, found.by_number(0), with_scale=True)
             return change, point_files.world_in_words(given.path, left_m)
         factor = (
             (stick_m or 1.0) / point_files.stick_length(found)
@@ -177,8 +181,7 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
         fits[name] = findings.PointFit(
             found.views.number[seen].tolist(), covariance_m2[index], residual_px, used
         )
-    shifts = map(str, find_point_shifts(found.rig, views))
-    notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
+    notes = [*_left_out(found, views), f"the world is {place}", *_weak(found, rig, covariance_m2)]
     return findings.result_of_points(rig, fits, notes)
 
 
@@ -203,15 +206,11 @@ def calibrate_by_known_points(
         raise SettingsError("--world", expected=expected, found=f"{settings.world}")
     sizes_wh: dict[str, tuple[int, int]] = {}
     if marker_corners_m is not None:
-        if len(sources) == 1 and is_recording(sources[0]):
-            videos = open_recording(sources[0]).videos
-        else:
-            opened = board_views.open_images(sources, settings.names)
-            videos = {camera.name: camera.video for camera in opened}
-        sizes_wh = {name: video.image_size_wh for name, video in videos.items()}
+        opened, _ = _open(sources, settings)
+        sizes_wh = {camera.name: camera.image_size_wh for camera in opened}
         marks = {
-            name: point_files.find_markers(video, marker_corners_m, settings.dictionary)
-            for name, video in videos.items()
+            camera.name: point_files.find_markers(camera.video, marker_corners_m, settings.dictionary)
+            for camera in opened
         }
     elif sources:
         raise SettingsError("--pairs", expected="no video", found=f"{sources[0]}")
@@ -234,12 +233,6 @@ def calibrate_by_known_points(
                 f"{1e3 * located.lens_shift_m:.0f} mm away, which its standard deviation contains; calibrate its lens"
             )
     return findings.result_of_points(make_rig(cameras), fits, notes)
-
-
-def _numbered(found: PointRig) -> dict[int, np.ndarray]:
-    """Positions of the moving point, of the first end of a stick, by the number of the instant."""
-    first = found.views.point == 0
-    return dict(zip(found.views.number[first].tolist(), found.points_m[first], strict=True))
 
 
 def _left_out(found: PointRig, views: PointViews) -> list[str]:

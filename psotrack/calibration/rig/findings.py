@@ -264,13 +264,11 @@ def coverage(calibrated: CalibratedRig, camera: int) -> Float[np.ndarray, "rows 
 
 def worst_views(calibrated: CalibratedRig) -> list[tuple[str, int, float]]:
     """Camera, number of the instant and median residual, pixels, of the views that fit worst."""
-    seen = np.isfinite(calibrated.residual_px).any(axis=-1)
-    typical = np.full(seen.shape, -1.0)
-    typical[seen] = np.nanmedian(calibrated.residual_px[seen], axis=-1)
-    order = np.argsort(-typical, axis=None)[: min(_WORST, int(seen.sum()))]
+    view_px = calibrated.view_px
+    order = np.argsort(-view_px, axis=None)[: min(_WORST, int(np.isfinite(view_px).sum()))]
     return [
-        (calibrated.rig.names[camera], int(calibrated.views.number[instant]), float(typical[camera, instant]))
-        for camera, instant in zip(*np.unravel_index(order, seen.shape), strict=True)
+        (calibrated.rig.names[camera], int(calibrated.views.number[instant]), float(view_px[camera, instant]))
+        for camera, instant in zip(*np.unravel_index(order, view_px.shape), strict=True)
     ]
 
 
@@ -302,17 +300,14 @@ def find_misfit(calibrated: CalibratedRig, advice: Sequence[str]) -> InputError 
     A board's place follows the cameras that agree on it, so that of two that do not each fits half of the instants.
     What counts is the camera that fits worst at each instant.
     """
-    residual_px, names = calibrated.residual_px, calibrated.rig.names
-    seen = np.isfinite(residual_px).any(axis=-1)
-    off_px = np.zeros(seen.shape)
-    off_px[seen] = np.nanmedian(residual_px[seen], axis=-1)
-    widths_px = calibrated.views.image_size_wh.max(axis=1)
-    worst = (off_px / widths_px[:, None]).max(axis=0)
+    view_px, widths_px = calibrated.view_px, calibrated.views.image_size_wh.max(axis=1)
+    seen = ~np.isnan(view_px)
+    worst = np.fmax.reduce(view_px / widths_px[:, None], axis=0)
     shared = seen & (seen.sum(axis=0) >= min(2, len(seen)))
     typical = [float(np.median(worst[of_camera])) if of_camera.any() else 0.0 for of_camera in shared]
     off = [
         f"{part * width:.1f} px with {name}"
-        for name, part, width in zip(names, typical, widths_px.tolist(), strict=True)
+        for name, part, width in zip(calibrated.rig.names, typical, widths_px.tolist(), strict=True)
         if part > _MISFIT
     ]
     causes = "check that the videos overlap in time, that no camera was moved, and the board's sizes"

@@ -94,6 +94,11 @@ class PointRig:
     residual_px: Float[np.ndarray, "sightings cameras"]
     used: Bool[np.ndarray, "sightings cameras"]
 
+    def by_number(self, point: int) -> dict[int, Float[np.ndarray, "3"]]:
+        """Positions of a point, or of one end of a stick, by the number of the instant."""
+        of_point = self.views.point == point
+        return dict(zip(self.views.number[of_point].tolist(), self.points_m[of_point], strict=True))
+
 
 def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
     """Place cameras with known lenses by a point that moves before them.
@@ -300,7 +305,14 @@ def adjust(rig: Rig, views: PointViews) -> PointRig:
     start_m = triangulate_linearly(rig.cameras, np.where(placed[..., None], points_px, np.nan))
     placed &= np.isfinite(start_m).all(axis=-1)[:, None]
     _check_seen(rig, placed)
-    bundle = _start(rig, start_m, np.where(placed[..., None], points_px, np.nan)).solved()
+    models, lenses = zip(*known_lenses(rig).values(), strict=True)
+    targets = np.tile(np.eye(4), (len(start_m), 1, 1))
+    targets[:, :3, 3] = start_m
+    state = BundleState(lenses, np.asarray(rig.cameras.T_cam_world), targets, np.ones(len(targets)))
+    free = np.arange(len(rig)) > 0, np.ones(len(targets), bool)
+    views_px = np.where(placed[..., None], points_px, np.nan).swapaxes(0, 1)[:, :, None]
+    bundle = Bundle.of_views(models, state, np.zeros((1, 3)), views_px, free=free, noise_px=_FIRST_PX)
+    bundle = bundle.solved()
     seen = bundle.problem.target, bundle.problem.camera
     unknowns = 6 * len(rig) - 7 + 3 * int(placed.any(axis=1).sum())
     noise_px = max(_LEAST_NOISE_PX, spread_px(bundle.distance_px[:, 0], unknowns))
@@ -323,21 +335,6 @@ def adjust(rig: Rig, views: PointViews) -> PointRig:
     cameras = replace(rig.cameras, T_cam_world=bundle.state.T_cam_world)
     points_m = np.where(used.any(axis=1)[:, None], bundle.state.T_world_target[:, :3, 3], np.nan)
     return PointRig(Rig(rig.names, cameras), views, points_m, residual_px, used)
-
-
-def _start(
-    rig: Rig,
-    points_m: Float[np.ndarray, "points 3"],
-    points_px: Float[np.ndarray, "points cameras 2"],
-) -> Bundle:
-    """The adjustment's first state, with a robust loss."""
-    models, lenses = zip(*known_lenses(rig).values(), strict=True)
-    points = np.tile(np.eye(4), (len(points_m), 1, 1))
-    points[:, :3, 3] = points_m
-    state = BundleState(lenses, np.asarray(rig.cameras.T_cam_world), points, np.ones(len(points)))
-    free = np.arange(len(rig)) > 0, np.ones(len(points), bool)
-    views_px = points_px.swapaxes(0, 1)[:, :, None]
-    return Bundle.of_views(models, state, np.zeros((1, 3)), views_px, free=free, noise_px=_FIRST_PX)
 
 
 def _check_seen(rig: Rig, seen: Bool[np.ndarray, "points cameras"]) -> None:

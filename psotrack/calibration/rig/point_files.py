@@ -243,11 +243,7 @@ def stick_length(point_rig: PointRig) -> float:
     Raises:
         InputError: the two ends are never known at one instant.
     """
-    views, points_m = point_rig.views, point_rig.points_m
-    first, second = (
-        dict(zip(views.number[views.point == end].tolist(), points_m[views.point == end], strict=True))
-        for end in (0, 1)
-    )
+    first, second = point_rig.by_number(0), point_rig.by_number(1)
     lengths = np.array(
         [np.linalg.norm(first[number] - second[number]) for number in first if number in second]
     )
@@ -290,7 +286,7 @@ def read_world(path: Path | str) -> GivenWorld:
     marked in images have also the columns camera, x_px, y_px.
 
     Raises:
-        InputError: the file cannot be read, or a column or a value is missing.
+        InputError: the file cannot be read, a column or a value is missing, or a point has two positions.
     """
     path = Path(path)
     table = read_table(path, _SEPARATOR, has_gaps=True)
@@ -302,9 +298,8 @@ def read_world(path: Path | str) -> GivenWorld:
             for name, place in zip(of_camera.points, of_camera.points_m, strict=True)
         }
         return GivenWorld(path, places, marks)
-    point, columns = table.column("point"), [table.column(name) for name in ("x_m", "y_m", "z_m")]
     return GivenWorld(
-        path, {row.text(point): np.array([row.number(one) for one in columns]) for row in table.rows}, {}
+        path, {name: np.array(place) for name, place in _places(table, required=True).items()}, {}
     )
 
 

@@ -27,7 +27,7 @@ from psotrack.calibration.extrinsics import ray_distances, solve_pnp
 from psotrack.calibration.lens_models import PINHOLE, LensModel
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.errors import InputError
-from psotrack.support import Advance
+from psotrack.support import Advance, evenly_spread
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
 _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)
@@ -107,8 +107,7 @@ def find_lens(
         Vector of the lens, or None if no view fits.
     """
     usable = np.flatnonzero(np.isfinite(views.corners_px[..., 0]).sum(axis=1) >= views.board.least_corners)
-    spread = np.linspace(0, len(usable) - 1, min(len(usable), _MOST_VIEWS)).round().astype(np.int64)
-    chosen = views.select(usable[spread])
+    chosen = views.select(usable[evenly_spread(len(usable), _MOST_VIEWS)])
     found: list[tuple[float, np.ndarray]] = []
     widths = _FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS
     starts_px = [width * views.image_size_wh[0] for width in widths] if focal_px is None else [focal_px]
@@ -315,7 +314,7 @@ def join_cameras(
             # The error, which is below 1, decides between pairs of which equally many instants agree.
             cost[first, second] = 1 + shared.max() - agreeing + error
     order, before = breadth_first_order(minimum_spanning_tree(cost), 0, directed=False)
-    check_joined(views, shared)
+    _check_joined(views, shared)
     T_cam_world = np.tile(np.eye(4), (count, 1, 1))
     for camera in order[1:]:
         T_cam_world[camera] = steps[before[camera], camera] @ T_cam_world[before[camera]]
@@ -344,7 +343,7 @@ def _transform(
     seen: _Seen, first: int, second: int, shared: Int[np.ndarray, " instants"]
 ) -> tuple[Float[np.ndarray, "4 4"], int, float]:
     """Transform from a camera to another, the number of instants that it fits, and its mean error in image widths."""
-    some = shared[np.linspace(0, len(shared) - 1, min(len(shared), _MOST_INSTANTS)).round().astype(np.int64)]
+    some = shared[evenly_spread(len(shared), _MOST_INSTANTS)]
     here, there = seen.poses[first, some], seen.poses[second, some]
     candidates = (there[:, :, None] @ np.linalg.inv(here)[:, None]).reshape(-1, 4, 4)
     errors = seen.errors(second, some, candidates[:, None, None] @ here.swapaxes(0, 1))[0].min(axis=1)
@@ -379,18 +378,9 @@ def _place_boards(
     return boards, labelling
 
 
-def check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"] | None = None) -> None:
-    """Check that instants at which two cameras see the board join all cameras.
-
-    Args:
-        views: the views.
-        shared: number of instants that two cameras share; None: those at which both see enough corners.
-
-    Raises:
-        InputError: the cameras are not all joined.
-    """
-    seen = views.seen.astype(np.int64)
-    count, group = connected_components(seen @ seen.T if shared is None else shared, directed=False)
+def _check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"]) -> None:
+    """Check that instants at which two cameras see the board, whose numbers are given, join all cameras."""
+    count, group = connected_components(shared, directed=False)
     if count > 1:
         first, second = ([views.names[index] for index in np.flatnonzero(group == one)] for one in (0, 1))
         parts = f"one of {', '.join(first)} and one of {', '.join(second)}"

@@ -34,7 +34,7 @@ from psotrack.recordings import (
     probe_images,
     read_frames_at,
 )
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, evenly_spread, no_progress
 
 _PATTERN = re.compile(r"[*?\[]")
 #: Largest number of instants in which the board is searched; limits the time for long videos.
@@ -242,8 +242,8 @@ def _open(name: str, path: Path) -> CameraImages:
 
 def first_images(cameras: Sequence[CameraImages], count: int) -> list[UInt8[np.ndarray, "_ _"]]:
     """About `count` grey images of each camera, evenly spread over the recording, of the cameras in turn."""
-    readers = [camera.read(camera.frames[:: max(1, len(camera.frames) // count)]) for camera in cameras]
-    return [one[1] for of_all in zip_longest(*readers) for one in of_all if one is not None]
+    steps = (max(1, len(camera.frames) // count) for camera in cameras)
+    return list(_in_turn(cameras, [each.frames[::step] for each, step in zip(cameras, steps, strict=True)]))
 
 
 @dataclass(frozen=True)
@@ -365,16 +365,14 @@ def _samples(
     cameras: Sequence[CameraImages], frames: Int[np.ndarray, "instants cameras"]
 ) -> Iterator[UInt8[np.ndarray, "height width"]]:
     """Grey images of all cameras in turn, evenly spread over the recording."""
-    chosen = []
-    for camera in range(frames.shape[1]):
-        there = frames[frames[:, camera] >= 0, camera]
-        # A round visits the recording from one end to the other, so that the first images differ.
-        picked = there[
-            np.linspace(0, len(there) - 1, min(len(there), _MOST_SAMPLES)).round().astype(np.int64)
-        ]
-        chosen.append(np.unique(picked))
-    readers = [camera.read(picked) for camera, picked in zip(cameras, chosen, strict=True)]
-    for _ in range(_MOST_SAMPLES):
-        for reader in readers:
-            for _, grey in islice(reader, 1):
-                yield grey
+    there = [of_camera[of_camera >= 0] for of_camera in frames.T]
+    # A round visits the recording from one end to the other, so that the first images differ.
+    return _in_turn(cameras, [one[evenly_spread(len(one), _MOST_SAMPLES)] for one in there])
+
+
+def _in_turn(
+    cameras: Sequence[CameraImages], chosen: Sequence[Int[np.ndarray, " chosen"]]
+) -> Iterator[UInt8[np.ndarray, "height width"]]:
+    """Grey images of chosen frames of each camera, of the cameras in turn."""
+    readers = [camera.read(frames) for camera, frames in zip(cameras, chosen, strict=True)]
+    return (one[1] for of_all in zip_longest(*readers) for one in of_all if one is not None)

@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
+from msgspec import Meta
+
 from psotrack import inside_out, trajectories
 from psotrack.cli.commands import command
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
-from psotrack.errors import InputError, check_positive, errors_name
+from psotrack.errors import InputError, errors_name
 from psotrack.recordings import exchange
 
 
@@ -22,7 +24,7 @@ def fuse(
     *,
     out: Path | None = None,
     point: Annotated[Literal["camera", "middle"], says(flag="at")] = "camera",
-    max_offset_s: Annotated[float | None, says(metavar="SECONDS")] = None,
+    max_offset_s: Annotated[Annotated[float, Meta(gt=0)] | None, says(metavar="SECONDS")] = None,
 ) -> None:
     """Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.
 
@@ -47,8 +49,6 @@ def fuse(
     out = out or outside.with_name("fused.csv")
     check_suffix("--out", out, ".csv")
     output.refuse(out)
-    if max_offset_s is not None:
-        check_positive("--max-offset", max_offset_s)
     paths: dict[str, inside_out.CameraPath] = {}
     for file in inside:
         path, name = inside_out.read_camera_path(file)

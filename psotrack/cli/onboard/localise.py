@@ -34,7 +34,7 @@ class SourceOptions:
     """
 
     markers: Path | None = None
-    side_m: float | None = None
+    side_m: Annotated[float, Meta(gt=0)] | None = None
     drone: Annotated[str | None, says(metavar="NAME")] = None
     name: Annotated[str | None, says(metavar="NAME")] = None
     dictionary: Dictionary = "4x4_1000"
@@ -108,8 +108,6 @@ def localise(
     """
     from dataclasses import replace
 
-    from psotrack.errors import check_positive
-
     source, drone_name, onboard = _input(video, given)
     out = out or Path(f"{drone_name}.csv")
     check_suffix("--out", out, ".csv")
@@ -119,12 +117,8 @@ def localise(
     table = given.markers or datasets.find_marker_corners(video)
     marker_map = inside_out.read_marker_table(table)
     centres_only = not isinstance(marker_map, inside_out.MarkerMap)
-    if given.side_m is not None:
-        check_positive("--marker-size", given.side_m)
-        if not centres_only:
-            raise SettingsError(
-                "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
-            )
+    if given.side_m is not None and not centres_only:
+        raise SettingsError("--marker-size", expected="a table of centres alone", found=f"corners in {table}")
     lens = lenses.of(source.image_size_wh, K=None if onboard is None else onboard.K)
     name, source = source.name, source.first(num_frames)
     rows = source.image_size_wh[1]

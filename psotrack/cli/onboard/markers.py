@@ -6,7 +6,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -17,12 +17,9 @@ from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, known_c
 from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import says
-from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import datasets
 from psotrack.support import POSITION, finite_or_none, format_numbers
-
-if TYPE_CHECKING:
-    from psotrack.foreground.markers import DetectedMarkers
 
 
 @command("detect")
@@ -60,19 +57,14 @@ def detect_markers(
     output.refuse(out)
     marker_dictionary(dictionary)
     photographs = _photographs(images)
-    found: list[DetectedMarkers]
+    source: inside_out.FrameSource | list[Path]
     if photographs is None:
-        names, what = None, "frames"
-        found = list(
-            inside_out.markers_of_video(
-                inside_out.open_source(images[0]).first(num_frames), dictionary, output.report
-            )
-        )
+        names, what, source = None, "frames", inside_out.open_source(images[0]).first(num_frames)
+    elif num_frames is not None:
+        raise SettingsError("--frames", expected="a video", found="images")
     else:
-        if num_frames is not None:
-            raise SettingsError("--frames", expected="a video", found="images")
-        names, what = _names(photographs), "images"
-        found = list(inside_out.markers_of_images(photographs, dictionary, output.report))
+        names, what, source = _names(photographs), "images", photographs
+    found = list(inside_out.markers_of(source, dictionary, output.report))
     inside_out.write_marker_table(out, found, names, force=output.force)
     counts = Counter(marker for markers in found for marker in markers.ids.tolist())
     showing = sum(len(markers) > 0 for markers in found)
@@ -139,7 +131,7 @@ class WorldOptions:
 
     known: Annotated[str | None, says(metavar="ID,ID...")] = None
     markers: Path | None = None
-    side_m: float | None = None
+    side_m: Annotated[float, Meta(gt=0)] | None = None
     estimate_sides: bool = False
 
 
@@ -201,8 +193,6 @@ def map_markers(
         out = out or Path("aruco_corners.csv")
         check_suffix("--out", out, ".csv")
         output.refuse(out)
-    if world.side_m is not None:
-        check_positive("--side", world.side_m)
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
             raise SettingsError(

@@ -137,15 +137,15 @@ def predict(motion: Motion, dt_s: float, agility: Agility) -> tuple[Motion, Matr
     Returns:
         The motion; and (21, 21) twice: transition F and process noise Q of the error state.
     """
-    model = _model(round(dt_s, 9))
-    mean, F = model.F @ motion.mean, model.F.copy()
+    still, by_acceleration, by_turns, of_correlated = _model(round(dt_s, 9))
+    mean, F = still @ motion.mean, still.copy()
     # The turn is 0 before, so that it is the turn rate times the time now.
     turn = mean[_TURN].copy()
     there = _rotation(turn)
     F[_TURN, _TURN] = there.T
     F[_TURN, _RATE] = dt_s * right_jacobian(turn)
-    Q = model.of_correlated + agility.acceleration_std_m_s2**2 * model.by_acceleration
-    Q = Q + agility.rate_change_std_rad_s**2 * model.by_turns
+    Q = of_correlated + agility.acceleration_std_m_s2**2 * by_acceleration
+    Q = Q + agility.rate_change_std_rad_s**2 * by_turns
     mean[_TURN] = 0.0
     later = Motion(mean, motion.R_world_cam @ there, F @ motion.covariance @ F.T + Q)
     return later, F, Q
@@ -261,19 +261,11 @@ def _correlated_root(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, 
     return (axes * np.sqrt(CORRELATED_FRACTION * np.maximum(variances, 0.0))) @ axes.T
 
 
-@dataclass(frozen=True)
-class _Model:
-    """Transition of the error state of a camera that does not turn, and process noise by its three causes."""
-
-    F: Matrix
-    by_acceleration: Matrix
-    by_turns: Matrix
-    of_correlated: Matrix
-
-
 @lru_cache(maxsize=256)
-def _model(dt_s: float) -> _Model:
-    """The model of `dt_s` seconds for accelerations of 1 m/s² and changes of the turn rate of 1 rad/s in a second.
+def _model(dt_s: float) -> tuple[Matrix, ...]:
+    """Transition of the error state of a camera that does not turn in `dt_s` seconds, and process noise by its causes.
+
+    The causes are accelerations of 1 m/s², changes of the turn rate of 1 rad/s in a second, and the correlated error.
 
     By the matrix exponential (C. F. Van Loan, Computing integrals involving the matrix exponential, IEEE Transactions
     on Automatic Control 23(3), 1978). The part of the turns neglects the turn of the axes during `dt_s`.
@@ -289,7 +281,7 @@ def _model(dt_s: float) -> _Model:
         both = expm(np.block([[-A, noise], [np.zeros((7, 7)), A.T]]) * dt_s)
         F = both[7:, 7:].T
         parts.append(np.kron(F @ both[:7, 7:], np.eye(3)))
-    return _Model(np.kron(F, np.eye(3)), *parts)
+    return np.kron(F, np.eye(3)), *parts
 
 
 def _symmetric(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

@@ -8,7 +8,7 @@ Rauch-Tung-Striebel smoother on the manifold of poses (`psotrack.geometry.estima
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -64,16 +64,15 @@ def choose_agility(
 
     best = (0, 0)
     for stride in _STRIDES:
-        while (better := max(_steps_around(best, stride), key=lambda steps: likelihood(*steps))) != best:
+        # These steps, and those that differ from them by a stride in one number.
+        beside = ((0, 0), (-stride, 0), (stride, 0), (0, -stride), (0, stride))
+        while True:
+            around = [(best[0] + along, best[1] + about) for along, about in beside]
+            better = max(around, key=lambda steps: likelihood(*steps))
+            if better == best:
+                break
             best = better
     return _agility(*best)
-
-
-def _steps_around(steps: tuple[int, int], stride: int) -> list[tuple[int, int]]:
-    """These steps, and those that differ from them by a stride in one number."""
-    along, about = steps
-    beside = [(along + sign * stride, about) for sign in (-1, 1)]
-    return [steps, *beside, *((along, about + sign * stride) for sign in (-1, 1))]
 
 
 def _agility(along: int, about: int) -> Agility:
@@ -82,23 +81,6 @@ def _agility(along: int, about: int) -> Agility:
         float(default.acceleration_std_m_s2 * _FACTOR**along),
         float(default.rate_change_std_rad_s * _FACTOR**about),
     )
-
-
-@dataclass(frozen=True)
-class _Findings:
-    """Findings of one run of the filter.
-
-    Attributes:
-        fits: (frames,), True if the frame's pose fits the motion, judged at the end of the run.
-        track: (frames,), number of the track, which changes where the camera jumps.
-        ambiguity: (frames,), ambiguity of the track.
-        agility: how wildly the camera may move into each frame.
-    """
-
-    fits: Bool[np.ndarray, "frames"]
-    track: Int[np.ndarray, "frames"]
-    ambiguity: Float[np.ndarray, "frames"]
-    agility: Sequence[Agility]
 
 
 def filter_path(
@@ -150,16 +132,15 @@ def smoothed_motions(
 ) -> list[Estimated]:
     """Smoothed pose and motion of every frame, from the frames' own poses at these times, seconds."""
     agility = choose_agility(time_s.tolist(), poses, params)
-    forward = _findings(time_s, poses, params, agility)
-    backward = _findings(-time_s[::-1], poses[::-1], params, agility)
-    fits = forward.fits & backward.fits[::-1]
-    ambiguity = np.fmin(forward.ambiguity, backward.ambiguity[::-1])
+    fits, track, ambiguity, agilities = _followed(time_s, poses, params, agility)
+    fits_back, _, ambiguity_back, _ = _followed(-time_s[::-1], poses[::-1], params, agility)
+    fits, ambiguity = fits & fits_back[::-1], np.fmin(ambiguity, ambiguity_back[::-1])
     found = [Estimated(None)] * len(poses)
-    for span in _spans(time_s, fits, forward.track, params.longest_gap_s):
+    for span in _spans(time_s, fits, track, params.longest_gap_s):
         constant = np.zeros((6, 6))
         for k, motion in zip(
             range(span.start, span.stop),
-            _smooth_span(time_s, poses, fits, span, forward.agility),
+            _smooth_span(time_s, poses, fits, span, agilities),
             strict=True,
         ):
             pose = poses[k]
@@ -169,13 +150,18 @@ def smoothed_motions(
     return found
 
 
-def _findings(
+def _followed(
     time_s: Float[np.ndarray, "frames"],
     poses: Sequence[CameraPose | None],
     params: PoseFilterParams,
     agility: Agility,
-) -> _Findings:
-    """Run the causal filter; poses of a track that is never confirmed do not count."""
+) -> tuple[Bool[np.ndarray, "frames"], Int[np.ndarray, "frames"], Float[np.ndarray, "frames"], list[Agility]]:
+    """Run the causal filter; poses of a track that is never confirmed do not count.
+
+    Returns:
+        (frames,) each: whether the frame's pose fits the motion, judged at the end of the run; number of the track,
+        which changes where the camera jumps; ambiguity of the track; and how wildly the camera may move into the frame.
+    """
     count = len(poses)
     fits, track, ambiguity = np.zeros(count, bool), np.zeros(count, int), np.full(count, np.nan)
     agilities = [agility] * count
@@ -195,7 +181,7 @@ def _findings(
         track[k], good[-1] = len(good) - 1, pose_filter.confirmed(run, params)
         if run.track is not None:
             ambiguity[k] = run.track.ambiguity
-    return _Findings(fits & np.array(good)[track], track, ambiguity, agilities)
+    return fits & np.array(good)[track], track, ambiguity, agilities
 
 
 def _spans(

@@ -261,9 +261,10 @@ def fuse(
             weighted = weighting.weigh(camera, own_m, track["covariance_m2"], point)
             if weighted.gross[:, 0].any():
                 gross_s = tracks.time_s[weighted.gross[:, 0]] + clocks_s[name]
-                camera = weighting.inside_at(
-                    _without_poses(paths[name], gross_s), tracks.time_s, clocks_s[name]
-                )
+                status = paths[name].status.copy()
+                status[weighting.nearest_index(paths[name].time_s, gross_s)] = Status.LOST
+                without = replace(paths[name], status=status)
+                camera = weighting.inside_at(without, tracks.time_s, clocks_s[name])
                 again = weighting.weigh(camera, own_m, track["covariance_m2"], point)
                 weighted = replace(again, gross=again.gross | weighted.gross)
         rows[name] = _fused_rows(camera, weighted, track["velocity_m_s"], point)
@@ -350,13 +351,6 @@ def _outside_rows(tracks: Trajectories, index: Int[np.ndarray, "frames"]) -> _Ro
     rows["status"] = np.where(index == UNASSIGNED, int(Status.LOST), rows["status"])
     source = np.where(rows["status"] == Status.TRACKED, 2, 0)
     return rows | {"orientation_wxyz": np.full((len(index), 4), np.nan), "source": source}
-
-
-def _without_poses(path: CameraPath, gross_s: Float[np.ndarray, "rows"]) -> CameraPath:
-    """The path without the poses nearest to some times."""
-    status = path.status.copy()
-    status[weighting.nearest_index(path.time_s, gross_s)] = Status.LOST
-    return replace(path, status=status)
 
 
 def _free_name(name: str, taken: Mapping[str, _Rows]) -> str:

@@ -242,7 +242,7 @@ def localise_video(
     began_s = time.perf_counter()
     with report("localise", source.num_frames or 0) as done:
         changes = FrameChanges()
-        detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds, changes), done)
+        detected: Iterable[Detected] = _detect_markers(source, detector, seconds, changes, done)
         if not source.stream:
             detected = _without_repeats(source.name, list(detected), changes)
         if isinstance(marker_map, MarkerCentres):
@@ -302,14 +302,12 @@ def _without_repeats(name: str, detected: list[Detected], changes: FrameChanges)
     ]
 
 
-def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
-    for one in detected:
-        yield one
-        done(1)
-
-
 def _detect_markers(
-    source: FrameSource, detector: MarkerDetector, seconds: dict[str, float], changes: FrameChanges
+    source: FrameSource,
+    detector: MarkerDetector,
+    seconds: dict[str, float],
+    changes: FrameChanges,
+    done: Advance,
 ) -> Iterator[Detected]:
     def found(frame: _GreyFrame) -> tuple[Detected, float]:
         number, time_s, gray = frame
@@ -324,6 +322,7 @@ def _detect_markers(
     for detected, spent_s in map_ahead(found, frames, workers):
         seconds["detect"] += spent_s
         yield detected
+        done(1)
 
 
 def _grey_frames(

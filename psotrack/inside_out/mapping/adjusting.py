@@ -22,7 +22,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import GATE, Bundle, BundleProblem, BundleState, KnownLens, spread_px, summed
@@ -141,7 +141,11 @@ def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
     of consecutive views; its variance is that of the sums over neighbouring pairs, whose errors are alike (Liang &
     Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73(1), 1986).
     """
-    first = np.flatnonzero(_is_followed(sightings))
+    # Views that the next frame of the same video follows.
+    step_s = np.where(np.diff(sightings.lens) == 0, np.diff(sightings.time_s), np.inf)
+    least_s = np.full(len(sightings.lenses), np.inf)
+    np.minimum.at(least_s, sightings.lens[:-1], step_s)
+    first = np.flatnonzero(step_s < 1.5 * least_s[sightings.lens[:-1]])
     if len(first) < _FEWEST_PAIRS:
         return None
     height = np.array([float(lens.image_size_wh[1]) for lens in sightings.lenses])[bundle.problem.lens]
@@ -187,14 +191,6 @@ def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
     return replace(moving, problem=replace(problem, motion_std=std)) if rolls else None
 
 
-def _is_followed(sightings: MarkerSightings) -> Bool[np.ndarray, " views"]:
-    """(views,), whether the next view is the next frame of the same video."""
-    step_s = np.where(np.diff(sightings.lens) == 0, np.diff(sightings.time_s), np.inf)
-    least_s = np.full(len(sightings.lenses), np.inf)
-    np.minimum.at(least_s, sightings.lens[:-1], step_s)
-    return np.append(step_s < 1.5 * least_s[sightings.lens[:-1]], False)
-
-
 def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarray, "markers 7 7"]:
     """(markers, 7, 7), covariance of the markers, in the order of increasing ids.
 
@@ -211,7 +207,10 @@ def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarra
     except np.linalg.LinAlgError:
         # A marker whose sightings are all outliers is undetermined, so no covariance is known.
         inverse = np.full_like(reduced.information, np.nan)
-    axes = _axes(sightings)
+    # Unit vectors as columns, (sightings, 4, 2, 2): away from the middle of the marker, and across.
+    out = outward(sightings)
+    out = out / np.linalg.norm(out, axis=-1, keepdims=True)
+    axes = np.stack([out, np.stack([-out[..., 1], out[..., 0]], axis=-1)], axis=-1)
     by_corner = (inverse @ _pulls(bundle, axes, reduced.gain))[videos:]
     # All four corners of a marker move outwards by sqrt(2) px where its sides move by 1 px.
     by_marker = np.sqrt(2) * by_corner.reshape(-1, count, 4, 2)[..., 0].sum(axis=-1)
@@ -227,13 +226,6 @@ def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarra
     centre_first = [3, 4, 5, 0, 1, 2, 6]
     of_markers = np.einsum("aiaj->aij", whole.reshape(count, 7, count, 7))
     return of_markers[:, centre_first][:, :, centre_first]
-
-
-def _axes(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2 2"]:
-    """(sightings, 4, 2, 2), unit vectors as columns: away from the middle of the marker, and across."""
-    out = outward(sightings)
-    out = out / np.linalg.norm(out, axis=-1, keepdims=True)
-    return np.stack([out, np.stack([-out[..., 1], out[..., 0]], axis=-1)], axis=-1)
 
 
 def _kept_px(bundle: Bundle, axes: Float[np.ndarray, "sightings 4 2 2"]) -> float:

@@ -24,7 +24,7 @@ from psotrack.inside_out.mapping.adjusting import adjust, adjusted_roughly, cova
 from psotrack.inside_out.mapping.initial_map import MarkerPlacer
 from psotrack.inside_out.mapping.sightings import MOST_FRAMES, MarkerSightings, collect_sightings
 from psotrack.inside_out.marker_map import SQUARE, MarkerCentres, MarkerMap, PlacedMarker, fit_square
-from psotrack.support import similarity
+from psotrack.support import evenly_spread, similarity
 
 #: Number of views for the initial map; the other views are used for markers that none of these shows.
 _FIRST_VIEWS = 100
@@ -114,7 +114,8 @@ def build_map(
     side_m = float(np.median([one.side_m for one in placed.values()])) if side_m is None else side_m
     check_positive("side_m", side_m)
     _check_known(sightings, list(known))
-    for part in (sightings.select(_spread_views(sightings)), sightings):
+    spread = evenly_spread(sightings.num_views, _FIRST_VIEWS)
+    for part in (sightings.select(np.isin(sightings.view, spread)), sightings):
         if set(sightings.ids) - set(placed):
             placed = MarkerPlacer(part, side_m, estimate_sides).place_all(placed, _NOISE_PX)
     # Known markers that no frame shows are left out.
@@ -153,13 +154,6 @@ def _check_known(sightings: MarkerSightings, known: list[int]) -> None:
             found=found,
             remedy="name another one by --known",
         )
-
-
-def _spread_views(sightings: MarkerSightings) -> Bool[np.ndarray, " sightings"]:
-    """Which sightings belong to views that are spread evenly over all views."""
-    count = min(_FIRST_VIEWS, sightings.num_views)
-    views = np.linspace(0, sightings.num_views - 1, count).round().astype(int)
-    return np.isin(sightings.view, views)
 
 
 def _connected(

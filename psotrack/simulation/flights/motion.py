@@ -338,15 +338,8 @@ def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
 
     Raises:
         InputError: `read_recorded_flight` cannot read the file.
-        SettingsError: the recorded flight ends before `start_s`.
     """
     recorded = read_recorded_flight(record.file)
-    if record.start_s >= recorded.duration_s:
-        raise SettingsError(
-            f"start_s of {record.file}",
-            expected=f"less than its duration, {recorded.duration_s:g} s",
-            found=f"{record.start_s:g}",
-        )
     return RecordedFlight(recorded, heading, record.start_s, np.array(record.offset_m), record.file)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import SettingsError, check_positive, install_command
+from psotrack.errors import SettingsError, install_command
 from psotrack.simulation.flights.motion import GRAVITY_M_S2, MIN_SAMPLES, Recorded, attitude
 from psotrack.simulation.world.rooms import HALLS
 from psotrack.support import Column, TextRow, read_table, write_rows
@@ -122,50 +122,39 @@ class FlightState:
     yaw_rad: float = 0.0
     turn_rad_s: float = 0.0
 
-    @classmethod
-    def hovering(cls, position_m: Vector) -> FlightState:
-        """State of a drone at rest that points along x."""
-        return cls(position_m, np.zeros(3), np.zeros(3))
 
-
-def step(state: FlightState, sticks: Sticks, dynamics: Dynamics, space: Space, step_s: float) -> FlightState:
+def step(state: FlightState, sticks: Sticks, space: Space, step_s: float) -> FlightState:
     """State after one step with constant stick positions."""
     x_m, v_m_s = state.position_m, state.velocity_m_s
-    commanded_m_s = _commanded_velocity(sticks, state.yaw_rad, dynamics)
+    # Forward and left at full deflection together are limited to the speed of one of them.
+    level = DYNAMICS.max_speed_m_s / max(1.0, float(np.hypot(sticks.forward, sticks.left)))
+    cos, sin = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
+    x, y = cos * sticks.forward - sin * sticks.left, sin * sticks.forward + cos * sticks.left
+    commanded_m_s = np.array([level * x, level * y, DYNAMICS.max_climb_m_s * sticks.up])
     # The thrust compensates the drag at the commanded velocity; otherwise the drone would not reach this velocity.
     # The thrust is limited already here, because the second limit would weaken the braking of a too large command.
-    push = _limit_thrust(
-        (commanded_m_s - v_m_s) / dynamics.response_s + dynamics.drag_per_s * commanded_m_s, dynamics
-    )
-    braking, drag = dynamics.braking_per_s, dynamics.drag_per_s * v_m_s
+    push = _limit_thrust((commanded_m_s - v_m_s) / DYNAMICS.response_s + DYNAMICS.drag_per_s * commanded_m_s)
+    braking, drag = DYNAMICS.braking_per_s, DYNAMICS.drag_per_s * v_m_s
     ends_m = (space.lower_m, space.upper_m)
     push = np.clip(push, *(braking * (braking * (end_m - x_m) - 2 * v_m_s) + drag for end_m in ends_m))
-    follow = -np.expm1(-step_s / dynamics.lag_s)
-    push = state.push_m_s2 + follow * (_limit_thrust(push, dynamics) - state.push_m_s2)
-    turn = state.turn_rad_s + follow * (sticks.turn * dynamics.max_turn_rad_s - state.turn_rad_s)
-    v_m_s = v_m_s + step_s * (push - dynamics.drag_per_s * v_m_s)
+    follow = -np.expm1(-step_s / DYNAMICS.lag_s)
+    push = state.push_m_s2 + follow * (_limit_thrust(push) - state.push_m_s2)
+    turn = state.turn_rad_s + follow * (sticks.turn * DYNAMICS.max_turn_rad_s - state.turn_rad_s)
+    v_m_s = v_m_s + step_s * (push - DYNAMICS.drag_per_s * v_m_s)
     x_m = x_m + step_s * v_m_s
     stopped_m = np.clip(x_m, space.lower_m, space.upper_m)
     v_m_s = np.where(stopped_m == x_m, v_m_s, 0.0)
     return FlightState(stopped_m, v_m_s, push, state.yaw_rad + step_s * turn, turn)
 
 
-def _commanded_velocity(sticks: Sticks, yaw_rad: float, dynamics: Dynamics) -> Vector:
-    # Forward and left at full deflection together are limited to the speed of one of them.
-    level = dynamics.max_speed_m_s / max(1.0, float(np.hypot(sticks.forward, sticks.left)))
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    x, y = cos * sticks.forward - sin * sticks.left, sin * sticks.forward + cos * sticks.left
-    return np.array([level * x, level * y, dynamics.max_climb_m_s * sticks.up])
-
-
-def _limit_thrust(push_m_s2: Vector, dynamics: Dynamics) -> Vector:
+def _limit_thrust(push_m_s2: Vector) -> Vector:
     """Thrust within the limits that is nearest to a given thrust; the vertical part has priority.
 
     The possible thrusts are a convex set, so a mixture of two possible thrusts, as the lag makes, is possible too.
     """
-    up = float(np.clip(push_m_s2[2], -dynamics.max_climb_m_s2, dynamics.max_climb_m_s2))
+    up = float(np.clip(push_m_s2[2], -DYNAMICS.max_climb_m_s2, DYNAMICS.max_climb_m_s2))
     level = float(np.hypot(push_m_s2[0], push_m_s2[1]))
-    most = float(np.tan(np.radians(dynamics.max_tilt_deg))) * (GRAVITY_M_S2 + up)
+    most = float(np.tan(np.radians(DYNAMICS.max_tilt_deg))) * (GRAVITY_M_S2 + up)
     share = min(1.0, most / level) if level > 0 else 1.0
     return np.array([share * push_m_s2[0], share * push_m_s2[1], up])
 
@@ -190,7 +179,6 @@ def fly(
     start_m: Vector,
     space: Space,
     *,
-    dynamics: Dynamics = DYNAMICS,
     rate_hz: float = 25.0,
     max_s: float = np.inf,
     watch: Callable[[float, FlightState], None] = lambda time_s, state: None,
@@ -201,7 +189,6 @@ def fly(
         samples: samples of the sticks, with times that increase from 0; the iterator may wait for a person.
         start_m: (3,), position at time 0, where the drone hovers.
         space: space that the drone stays in.
-        dynamics: dynamics of the drone.
         rate_hz: rate of the recorded flight; its times are exactly k / rate_hz.
         max_s: longest duration of the flight.
         watch: function that is called with the time of each sample and the state at that time.
@@ -210,10 +197,8 @@ def fly(
         The recorded flight, and the samples of the sticks that made it.
 
     Raises:
-        SettingsError: the start is outside the space, the rate is not above 0, the samples' times do not increase, or
-            the flight is too short to be replayed.
+        SettingsError: the start is outside the space, or the flight is too short to be replayed.
     """
-    check_positive("rate", rate_hz)
     if not np.all((start_m >= space.lower_m) & (start_m <= space.upper_m)):
         lower, upper, start = (
             ", ".join(f"{value:g}" for value in point) for point in (space.lower_m, space.upper_m, start_m)
@@ -221,20 +206,17 @@ def fly(
         raise SettingsError("start", expected=f"a point from ({lower}) to ({upper})", found=f"({start})")
     per_record = int(np.ceil(_MIN_STEPS_HZ / rate_hz))
     step_s = 1 / (rate_hz * per_record)
-    state, sticks, done = FlightState.hovering(start_m), Sticks(), 0
+    # At rest, and pointing along x.
+    state, sticks, done = FlightState(start_m, np.zeros(3), np.zeros(3)), Sticks(), 0
     records: list[FlightState] = [state]
     used: list[Sample] = []
     for sample in samples:
-        if used and sample.time_s <= used[-1].time_s:
-            raise SettingsError(
-                "sticks", expected=f"a time after {used[-1].time_s:g} s", found=f"{sample.time_s:g} s"
-            )
         if sample.time_s >= max_s:
             sample = Sample(max_s, sticks)
         used.append(sample)
         due = int(sample.time_s / step_s + _ROUNDING)
         while done < due:
-            state = step(state, sticks, dynamics, space, step_s)
+            state = step(state, sticks, space, step_s)
             done += 1
             if done % per_record == 0:
                 records.append(state)

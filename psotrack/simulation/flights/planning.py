@@ -11,6 +11,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 from typing import Any, NamedTuple
 
 import msgspec
@@ -51,41 +52,31 @@ from psotrack.simulation.scenarios import (
 _PERPENDICULAR = 1e-6
 
 
-def followed(record: FlightRecord) -> tuple[str, int] | None:
-    """Field and number of the drone that a flight is relative to; None for an independent flight."""
-    if isinstance(record, Formation | FollowingFlight):
-        return "leader", record.leader
-    if isinstance(record, NearPass):
-        return "other", record.other
-    return None
-
-
 def flying_order(scenario: Scenario) -> tuple[int, ...]:
     """Indices of the drones in an order in which each drone comes after the drone that its flight is relative to.
 
     Raises:
         SettingsError: a flight is relative to a drone that does not exist, or, along a chain, to itself.
     """
-    order: list[int] = []
-    for index in range(len(scenario.drones)):
-        chain = _chain(scenario, index)
-        order += [link for link in reversed(chain) if link not in order]
-    return tuple(order)
-
-
-def _chain(scenario: Scenario, index: int) -> list[int]:
-    """Index of a drone, then of the drone that its flight is relative to, and so on along the chain."""
-    chain, count = [index], len(scenario.drones)
-    while relation := followed(scenario.drones[chain[-1]].flight):
-        name, number = relation
-        field = f"drones[{chain[-1]}].flight.{name}"
-        if number > count:
-            raise scenario_error(scenario, field, f"a drone's number, 1 to {count}", number)
-        chain.append(number - 1)
-        if chain[-1] in chain[:-1]:
-            loop = " -> ".join(f"{link + 1}" for link in chain)
-            raise scenario_error(scenario, field, "relative flights without a cycle", f"drones {loop}")
-    return chain
+    count = len(scenario.drones)
+    fields: dict[int, str] = {}
+    before: dict[int, list[int]] = {index: [] for index in range(count)}
+    for index, drone in enumerate(scenario.drones):
+        for name in ("leader", "other"):
+            number = getattr(drone.flight, name, None)
+            if number is not None:
+                fields[index] = f"drones[{index}].flight.{name}"
+                before[index].append(number - 1)
+                if number > count:
+                    raise scenario_error(scenario, fields[index], f"a drone's number, 1 to {count}", number)
+    try:
+        return tuple(TopologicalSorter(before).static_order())
+    except CycleError as error:
+        # Each drone of the cycle is one that the next one follows.
+        cycle = error.args[1][::-1]
+        found = f"drones {' -> '.join(f'{index + 1}' for index in cycle)}"
+        expected = "relative flights without a cycle"
+        raise scenario_error(scenario, fields[cycle[-2]], expected, found) from None
 
 
 def check_records(scenario: Scenario) -> None:
@@ -360,7 +351,6 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
         InputError: a recorded flight cannot be used.
     """
     check_records(scenario)
-    flying_order(scenario)
     time_s = frame_times_s(scenario, scenario.num_frames)
     recorded = _recorded(scenario, time_s)
     # Other variations often violate a limit at the same frames, so these frames are checked first.

@@ -58,10 +58,6 @@ class Mirror:
         share = self.share[..., None]
         return replace(empty, light=(1 - share) * empty.light + share * self.light)
 
-    def share_of_rest(self, light: Light) -> _Pixels:
-        """(height, width), share of each pixel's light that is not mirrored."""
-        return 1 - self.share * self.light.sum(axis=-1) / np.maximum(light.sum(axis=-1), 1e-6)
-
     def reflect(
         self, image: Image, posed: list[raster.PosedDrone], samples: raster.Samples, lens_blur_px: float
     ) -> None:
@@ -110,13 +106,9 @@ def mirror(room: Room, cam: raster.Pinhole, imaging: Imaging, empty: Backdrop) -
     light = render_light(below, cam, imaging.antialiasing)
     beyond = np.clip(1 - empty.depth_m / depth, 0, 1)
     floor = lens_blur(empty.floor.astype(np.float32), imaging.lens_blur_px)
-    share = fresnel(_cosine_to_floor(cam), imaging.reflections) * floor
+    # By the cosine of the angle of incidence (Schlick, 1994); 1 at grazing incidence.
+    share = (imaging.reflections + (1 - imaging.reflections) * (1 - _cosine_to_floor(cam)) ** 5) * floor
     return Mirror(cam, share, _blurred(light, beyond, ROUGHNESS_RAD * cam.K[0, 0], imaging), depth)
-
-
-def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.ndarray, "*shape"]:
-    """Share of mirrored light by the cosine of the angle of incidence (Schlick, 1994); 1 at grazing incidence."""
-    return at_normal + (1 - at_normal) * (1 - cosine) ** 5
 
 
 def _cosine_to_floor(cam: raster.Pinhole) -> _Pixels:
@@ -214,8 +206,11 @@ class FloorShadows(FloorLight):
         x, y, width, height = cv2.boundingRect(backdrop.floor.astype(np.uint8))
         self._window = (slice(y, y + height), slice(x, x + width))
         self._H = raster.from_corner(x, y) @ self.to_image(cam)
-        # Drones above the floor do not block the light that the floor mirrors towards the camera.
-        matt = backdrop.floor if mirror is None else backdrop.floor * mirror.share_of_rest(backdrop.light)
+        matt = backdrop.floor
+        if mirror is not None:
+            # Drones above the floor do not block the light that the floor mirrors towards the camera.
+            mirrored = mirror.share * mirror.light.sum(axis=-1)
+            matt = matt * (1 - mirrored / np.maximum(backdrop.light.sum(axis=-1), 1e-6))
         self._matt = (255 * matt[self._window]).round().astype(np.uint8)
 
     def cast(self, image: Image, time_s: float) -> None:

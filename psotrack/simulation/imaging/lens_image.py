@@ -171,36 +171,27 @@ def strips(height: int, motion_px: float, sample: int, num_samples: int) -> Iter
             yield Strip(max(first, 0), min(first + rows, height), first + (rows - 1) / 2)
 
 
-class LensStrips:
-    """Shows strips of a camera's image by views without distortion.
-
-    Args:
-        camera: intrinsics of the camera, at the origin.
-    """
-
-    def __init__(self, camera: Camera) -> None:
-        self._lens: LensImage | None = lens_image(camera) if camera.dist.any() else None
-
-    def show(
-        self, strip: Strip, cam: Pinhole, draw: Callable[[RasterView], Shaped[np.ndarray, "..."]]
-    ) -> Shaped[np.ndarray, "..."]:
-        """The strip as a camera at the pose of `cam` sees it; `draw` gives the image of a view."""
-        if self._lens is None:
-            return draw(replace(full_view(cam), y=strip.first, height=strip.end - strip.first))
-        face, at_px = self._lens.face[strip.rows], self._lens.at_px[strip.rows]
-        images = []
-        for index, one in enumerate(self._lens.faces):
-            seen = face == index
-            if not seen.any():
-                continue
-            x, y = np.maximum(np.floor(at_px[seen].min(axis=0)).astype(int) - _STRIP_MARGIN_PX, 0).tolist()
-            right, bottom = (np.ceil(at_px[seen].max(axis=0)).astype(int) + _STRIP_MARGIN_PX + 1).tolist()
-            whole = full_view(Pinhole(one.R @ cam.R, one.R @ cam.t_m, one.K, one.width, one.height))
-            view = replace(
-                whole, x=x, y=y, width=min(right, one.width) - x, height=min(bottom, one.height) - y
-            )
-            columns, rows = (np.ascontiguousarray(at_px[..., axis]) for axis in (0, 1))
-            columns, rows = columns - np.float32(x), rows - np.float32(y)
-            image = cv2.remap(draw(view), columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            images.append(np.where(seen.reshape(seen.shape + (1,) * (image.ndim - 2)), image, 0))
-        return sum(images[1:], images[0])
+def show_strip(
+    lens: LensImage | None,
+    strip: Strip,
+    cam: Pinhole,
+    draw: Callable[[RasterView], Shaped[np.ndarray, "..."]],
+) -> Shaped[np.ndarray, "..."]:
+    """The strip as a camera at the pose of `cam` sees it; `draw` gives the image of a view."""
+    if lens is None:
+        return draw(replace(full_view(cam), y=strip.first, height=strip.end - strip.first))
+    face, at_px = lens.face[strip.rows], lens.at_px[strip.rows]
+    images = []
+    for index, one in enumerate(lens.faces):
+        seen = face == index
+        if not seen.any():
+            continue
+        x, y = np.maximum(np.floor(at_px[seen].min(axis=0)).astype(int) - _STRIP_MARGIN_PX, 0).tolist()
+        right, bottom = (np.ceil(at_px[seen].max(axis=0)).astype(int) + _STRIP_MARGIN_PX + 1).tolist()
+        whole = full_view(Pinhole(one.R @ cam.R, one.R @ cam.t_m, one.K, one.width, one.height))
+        view = replace(whole, x=x, y=y, width=min(right, one.width) - x, height=min(bottom, one.height) - y)
+        columns, rows = (np.ascontiguousarray(at_px[..., axis]) for axis in (0, 1))
+        columns, rows = columns - np.float32(x), rows - np.float32(y)
+        image = cv2.remap(draw(view), columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        images.append(np.where(seen.reshape(seen.shape + (1,) * (image.ndim - 2)), image, 0))
+    return sum(images[1:], images[0])

@@ -27,7 +27,7 @@ from psotrack.simulation.flights.motion import quaternions_wxyz
 from psotrack.simulation.flights.planning import frame_times_s
 from psotrack.simulation.imaging import backdrop, raster, sensor
 from psotrack.simulation.imaging.floor import FloorLight, FloorShadows, Mirror, mirror
-from psotrack.simulation.imaging.lens_image import LensImage, LensStrips, Strip, lens_image, strips
+from psotrack.simulation.imaging.lens_image import LensImage, Strip, lens_image, show_strip, strips
 from psotrack.simulation.imaging.scenery import Scenery
 from psotrack.simulation.imaging.sensor import Image
 from psotrack.simulation.labels import Silhouette, lens_silhouettes, silhouettes
@@ -88,10 +88,6 @@ class CameraRenderer:
         self.scenery.light(image, self.scene.time_s(frame))
         return image
 
-    def empty_room(self) -> Image:
-        """(height, width, 3), BGR image of the room without drones and without the effects of the sensor."""
-        return self.assemble([view.empty_room() for view in self.views])
-
     def assemble(self, images: Sequence[_Part]) -> Image:
         """(height, width, 3), the image of the camera, from the images of its views; their sizes may differ."""
         return images[0] if self.lens is None else self.lens.assemble(images)
@@ -116,6 +112,9 @@ class View:
         cam: the camera.
         behind: what changes behind the drones, in the image of the lens.
         shows_px: (height, width, 2), column and row of the lens's image that each pixel shows; None: the same image.
+
+    Attributes:
+        empty_room: (height, width, 3), BGR image of the room without drones.
     """
 
     def __init__(
@@ -134,13 +133,13 @@ class View:
             self.mirror = mirror(scene.room, self.cam, imaging, self.backdrop)
             self.backdrop = self.mirror.on(self.backdrop)
         self.shadows = FloorShadows(scene, self.cam, self.backdrop, self.mirror)
-        self._clean: Image = sensor.develop(self.backdrop.light)
+        self.empty_room: Image = sensor.develop(self.backdrop.light)
         self._samples = raster.pass_samples(imaging)
         self._behind, self._shows_px = behind, shows_px
 
     def clean_frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame without the effects of the sensor."""
-        image = self._clean.copy()
+        image = self.empty_room.copy()
         imaging = self.scene.scenario.imaging
         time_s = self.scene.time_s(frame)
         self.shadows.cast(image, time_s)
@@ -157,10 +156,6 @@ class View:
             seen = raster.average(window, drones, self._samples, self.backdrop.depth_m[window.slices])
             sensor.draw_over(image[window.slices], backdrop.lens_blur(seen, blur_px))
         return image
-
-    def empty_room(self) -> Image:
-        """(height, width, 3), BGR image of the room without drones."""
-        return self._clean.copy()
 
 
 class OnboardRenderer:
@@ -180,7 +175,8 @@ class OnboardRenderer:
         )
         stream = sensor.ONBOARD_STREAM + drone_index
         self.sensor = sensor.Sensor(imaging, scene.seed, stream, (self.height, self.width))
-        self._lens_strips = LensStrips(lens(scene))
+        camera = lens(scene)
+        self._lens: LensImage | None = lens_image(camera) if camera.dist.any() else None
         self._imaging = imaging
         self._floor = FloorLight(scene)
         self._painter = _room_painter(scene.scenario.hall, scene.scenario.markers, scene.scale)
@@ -232,7 +228,7 @@ class OnboardRenderer:
                 part[...] = (mixed + 0.5).astype(np.uint16)
             return light
 
-        return self._lens_strips.show(strip, self.cam_at(during_s), draw)
+        return show_strip(self._lens, strip, self.cam_at(during_s), draw)
 
     def _row_time_s(self, time_s: float, row: float) -> float:
         """When the middle of the exposure of a row is, for a frame whose middle row is exposed at `time_s`."""
@@ -275,7 +271,7 @@ class OnboardRenderer:
         seen = np.zeros(total.shape[:2], np.uint8)
         for strip in strips(self.height, row_px, 0, 1):
             cam = self.cam_at(self._row_time_s(time_s, strip.middle))
-            seen[strip.rows] = self._lens_strips.show(strip, cam, draw)
+            seen[strip.rows] = show_strip(self._lens, strip, cam, draw)
         # Above the horizon, a pixel's line meets the floor behind the camera; the floor's share is 0 at these pixels.
         x, y, width, height = cv2.boundingRect(seen)
         part = total[y : y + height, x : x + width]

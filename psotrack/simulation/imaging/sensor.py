@@ -131,7 +131,10 @@ class Sensor:
             scale = 1 / (self._sigma_unit * _TILE_UNIT)
             noise = cv2.multiply(tile, cv2.LUT(exposed, self._sigma), scale=scale, dtype=cv2.CV_8S)
             exposed = cv2.add(exposed, noise, dtype=cv2.CV_8U)
-        return _compress(exposed, self._imaging.jpeg_quality) if self._imaging.jpeg_quality else exposed
+        if not self._imaging.jpeg_quality:
+            return exposed
+        _, data = cv2.imencode(".jpg", exposed, [cv2.IMWRITE_JPEG_QUALITY, self._imaging.jpeg_quality])
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
 
     def _rng(self, purpose: int, frame: int = 0) -> np.random.Generator:
         return np.random.default_rng([self._seed, self._stream, frame, purpose])
@@ -142,8 +145,3 @@ def _noise_tile(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     # The noise of neighbouring pixels and of channels is correlated, as after demosaicing.
     mixed = cv2.transform(cv2.GaussianBlur(noise, (0, 0), 0.5), _CHANNEL_MIX)
     return np.clip((mixed * (_TILE_UNIT / mixed.std())).round(), -127, 127).astype(np.int8)
-
-
-def _compress(image: Image, quality: int) -> Image:
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
