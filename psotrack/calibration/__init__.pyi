@@ -29,7 +29,7 @@ from .rig.point_files import (
     views_of_detections,
 )
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
-from .rig.shifts import find_board_shifts
+from .rig.shifts import Shift, find_board_shifts, find_point_shifts
 from .rig.start import LensViews, choose_lens_model
 from .rig.views import (
     BoardViews,
@@ -69,6 +69,7 @@ __all__ = [
     "PointViews",
     "RigCalibration",
     "RigSettings",
+    "Shift",
     "Similarity",
     "Solver",
     "advise",
@@ -88,6 +89,7 @@ __all__ = [
     "figures_of",
     "find_board_shifts",
     "find_markers",
+    "find_point_shifts",
     "find_views",
     "fit_world",
     "instants_of_numbers",

@@ -37,6 +37,7 @@ from psotrack.calibration import (
     distance_between,
     figures_of,
     find_board_shifts,
+    find_point_shifts,
     fit_world,
     known_lenses,
     read_world,
@@ -278,6 +279,23 @@ def test_a_moving_point_places_all_cameras():
     assert found.used[seen & ~wrong].mean() > 0.95
     # The median distance is 1.2 standard deviations, of which a fit takes a part away.
     assert 0.3 < np.median(found.residual_px[found.used]) < 0.8
+
+
+@pytest.mark.parametrize("late", [0, 20])
+def test_a_camera_that_is_late_by_many_instants_is_named(late):
+    """The point flies at 1 m/s, 30 instants per second, with false sightings; each ten seconds it rests for three."""
+    rests, seconds = np.divmod(np.arange(900) / 30, 10)
+    flown = np.minimum(seconds, 7) + rests * 7
+    path = [0.8 * np.sin(flown), 0.8 * np.cos(0.7 * flown), 1.1 + 0.5 * np.sin(1.3 * flown)]
+    pixels, _ = fly(np.random.default_rng(0), np.stack(path, axis=-1))
+    pixels[late:, 3] = pixels[: len(pixels) - late, 3]
+    views = views_at(pixels)
+    shifts = find_point_shifts(calibrate_by_point(FOUR, views).rig, views)
+    assert [shift.camera for shift in shifts] == ["c3"] * bool(late)
+    if late:
+        # A shift of one instant moves a sighting by about ten pixels, which is beyond the gate.
+        assert abs(shifts[0].instants + late) <= 1
+        assert "c3 shows the scene late by about" in str(shifts[0])
 
 
 def test_stated_deviations_hold_in_the_world_of_the_point():

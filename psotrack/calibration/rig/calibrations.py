@@ -26,7 +26,7 @@ from psotrack.calibration.rig.moving_point import (
     covariance_of_centres,
 )
 from psotrack.calibration.rig.settings import RigSettings
-from psotrack.calibration.rig.shifts import find_board_shifts
+from psotrack.calibration.rig.shifts import find_board_shifts, find_point_shifts
 from psotrack.calibration.rig.views import CameraImages, FoundBoards, Instants
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
@@ -181,7 +181,8 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
         fits[name] = findings.PointFit(
             found.views.number[seen].tolist(), covariance_m2[index], residual_px, used
         )
-    notes = [*_left_out(found, views), f"the world is {place}", *_weak(found, rig, covariance_m2)]
+    shifts = map(str, find_point_shifts(found.rig, views))
+    notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
     return findings.result_of_points(rig, fits, notes)
 
 

@@ -1,12 +1,14 @@
-"""Cameras whose frames of a board are counted wrongly: they see its motion at other instants than the others.
+"""Cameras whose frames are counted wrongly: their sightings fit what the other cameras see at other instants.
 
-What moves is elsewhere at another instant, so a camera whose frames are counted wrongly has no pose that fits. The
+What moves is elsewhere at another instant, so a camera whose frames are counted wrongly has no pose that fits. By a
+moving point it is placed by its slowest sightings then, and the rest are left out as if they were of something else. A
 board's motion is known to each camera alone, and tells the shift before any camera is placed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -14,12 +16,25 @@ from jaxtyping import Float, Int
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.extrinsics import solve_pnp_ransac
 from psotrack.calibration.lens_models import LensModel
+from psotrack.calibration.rig.moving_point import PointViews
 from psotrack.calibration.rig.start import find_board_poses
 from psotrack.calibration.rig.views import BoardViews
+from psotrack.geometry import Rig, project, triangulate_linearly, undistort
 from psotrack.support import similarity
 from psotrack.trajectories.resampling import interpolated
 
+#: Largest shift of a moving point that is looked for, instants: two seconds of 30 per second.
+_MOST_SHIFT = 60
+#: Distance in the image up to which a moving point's sighting fits, pixels: ten times the error of a usual detector.
+_FITS_PX = 5.0
+#: A camera of whose sightings a larger fraction fits is sound.
+_SOUND = 0.6
+#: Least gain of the fraction that fits to tell a shift; clutter fits a few more sightings at any shift.
+_LEAST_GAIN = 0.2
+#: Smallest and largest number of sightings that are compared.
+_LEAST, _MOST = 24, 300
 #: Smallest number of instants that two cameras share at a shift of a board, and largest number of frames between two
 #: instants, half a second of 30 per second: a hand turns round within less.
 _LEAST_SHARED, _MOST_STEP = 12, 15
@@ -28,6 +43,53 @@ _LEAST_SHARED, _MOST_STEP = 12, 15
 _EXPLAINED, _BETTER = 0.3, 0.5
 #: Rounds of a fit of two motions without outliers.
 _ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A camera whose sightings fit the others better at other instants.
+
+    Attributes:
+        camera: name of the camera.
+        instants: its sightings of an instant fit the others at this many instants later.
+        fits: fraction of its sightings that fit as they are counted.
+        shifted_fits: fraction that fits with the shift.
+    """
+
+    camera: str
+    instants: int
+    fits: float
+    shifted_fits: float
+
+    def __str__(self) -> str:
+        early, add, to = ("early", "add", "to") if self.instants > 0 else ("late", "subtract", "from")
+        count = abs(self.instants)
+        return (
+            f"{self.camera} shows the scene {early} by about {count} instants: {self.shifted_fits:.0%} of its "
+            f"sightings fit the other cameras then, {self.fits:.0%} as its frames are counted; "
+            f"{add} {count} instants {to} its time_offset_s in a recording.toml, or check its frame numbers, and run "
+            "again"
+        )
+
+
+def find_point_shifts(rig: Rig, views: PointViews) -> list[Shift]:
+    """Cameras whose sightings of a moving point fit the others much better if their instants are counted otherwise.
+
+    Args:
+        rig: the rig that was found from the sightings.
+        views: all sightings, of which instants follow each other at one rate.
+    """
+    key, shifts = 2 * views.number + views.point, []
+    for index in range(len(rig) if len(rig) > 2 else 0):
+        # Positions of the point by the other cameras, where these agree.
+        others_px = views.points_px.copy()
+        others_px[:, index] = np.nan
+        points_m = triangulate_linearly(rig.cameras, others_px)
+        distance_px = np.linalg.norm(project(rig.cameras, points_m[:, None])[0] - others_px, axis=-1)
+        disagree = np.any(distance_px > _FITS_PX, axis=1)
+        points_m = np.where(disagree[:, None], np.nan, points_m)
+        shifts += _shift(rig, index, key, views.points_px[:, index], points_m)
+    return shifts
 
 
 def find_board_shifts(
@@ -128,3 +190,41 @@ def _left(
         near = distance_m <= 2 * np.median(distance_m)
     extent_m = np.median(np.linalg.norm(a - np.median(a, axis=0), axis=-1))
     return float(np.median(distance_m) / max(extent_m, 1e-300)), shared
+
+
+def _shift(
+    rig: Rig,
+    index: int,
+    key: Int[np.ndarray, " points"],
+    points_px: Float[np.ndarray, "points 2"],
+    points_m: Float[np.ndarray, "points 3"],
+) -> list[Shift]:
+    """The shift of a camera, if it has one; the camera is placed anew for each shift.
+
+    Args:
+        rig: the cameras.
+        index: index of the camera.
+        key: numbers of points, two for each instant.
+        points_px: the camera's pixels of the points; NaN where it does not see one.
+        points_m: their positions by the other cameras; NaN where they do not know one.
+    """
+    gate = _FITS_PX / float(rig.cameras.K[index, 0, 0])
+    rays, known = undistort(rig.cameras[index], points_px), np.isfinite(points_m[:, 0])
+    is_seen = np.isfinite(rays[:, 0])
+    rays, known_m = rays[is_seen], points_m[known]
+    fractions: dict[int, float] = {}
+    least = _LEAST
+    for shift in sorted(range(-_MOST_SHIFT, _MOST_SHIFT + 1), key=abs):
+        _, here, there = np.intersect1d(key[is_seen] + shift * 2, key[known], return_indices=True)
+        if len(here) >= least:
+            some = np.linspace(0, len(here) - 1, min(len(here), _MOST)).astype(np.int64)
+            found = solve_pnp_ransac(known_m[there[some]], rays[here[some]], gate)
+            fractions[shift] = 0.0 if found is None else float(found[1].mean())
+        if shift == 0:
+            if fractions.get(0, 1.0) >= _SOUND:
+                return []
+            # The sightings of one instant or two, of a long shift, fit some pose in any case.
+            least = max(_LEAST, len(here) // 2)
+    best = max(fractions, key=lambda shift: fractions[shift])
+    gain = fractions[best] - fractions[0]
+    return [Shift(rig.names[index], best, fractions[0], fractions[best])] if gain > _LEAST_GAIN else []
