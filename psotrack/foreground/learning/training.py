@@ -139,7 +139,7 @@ def train(
     start = model_at(path) if settings.start else None
     about = {**about, "start": digest_file(path) if start else None}
     of = digest_record({"settings": msgspec.to_builtins(settings), "about": about})
-    state, history = _resumed(unfinished, teacher.begin(start and start.network), of)
+    state, history = _resumed(unfinished, teacher.begin(start.network if start else None), of)
     with report("train", steps) as advance, ThreadPoolExecutor(1) as ahead:
         advance(len(history) * settings.steps)
         while len(history) < settings.epochs and _since_best(history) < settings.patience:
