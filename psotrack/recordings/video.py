@@ -270,31 +270,8 @@ def read_frames(
     """
     if step < 1:
         raise SettingsError("step", expected="1 or more", found=f"{step}")
-    if video.images:
-        for path in video.images[: video.num_frames : step]:
-            image = read_image(path, video.depth_bits)
-            _check_size(path, video, image)
-            yield image
-        return
-    frame: UInt8[np.ndarray, "height width 3"] | None = None
-    reached = -1
-    with open_capture(video.path) as capture:
-        for index in range(video.num_frames):
-            if reached < index:
-                if _grab(capture):
-                    reached = max(index, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
-                elif index and video.is_timed and video.num_frames - index <= _END_S * video.fps:
-                    reached = video.num_frames
-                else:
-                    raise TruncatedVideoError(video, index)
-            if index % step:
-                continue
-            if reached == index or frame is None:
-                decoded, frame = capture.retrieve(frame if into_one else None)
-                if not decoded:
-                    raise TruncatedVideoError(video, index)
-                _check_size(video.path, video, frame, f" in frame {index}")
-            yield frame
+    numbers = range(0, video.num_frames, step)
+    return (frame for _, frame in _read(video, numbers, into_one=into_one))
 
 
 def _number_at(video: VideoInfo, time_s: float) -> int:
@@ -319,27 +296,42 @@ def read_frames_at(
     Raises:
         InputError: the file ends or is damaged before a frame, or a frame has another size.
     """
+    return _read(video, numbers, is_sparse=True)
+
+
+def _read(
+    video: VideoInfo, numbers: Sequence[int], *, into_one: bool = False, is_sparse: bool = False
+) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+    """Yield chosen frames and their numbers; of sparse ones, those far ahead are sought."""
     if video.images:
         for number in numbers:
-            frame = read_image(video.images[number], video.depth_bits)
-            _check_size(video.images[number], video, frame)
-            yield number, frame
+            image = read_image(video.images[number], video.depth_bits)
+            _check_size(video.images[number], video, image)
+            yield number, image
         return
-    following = 0
+    frame: UInt8[np.ndarray, "height width 3"] | None = None
+    reached = -1
     with open_capture(video.path) as capture:
         for number in numbers:
-            if number - following > _WORTH_SEEKING and video.is_finished and not video.times_s:
+            is_far = is_sparse and number - reached > _WORTH_SEEKING + 1
+            if is_far and video.is_finished and not video.times_s:
                 with silence_opencv():
                     if capture.set(cv2.CAP_PROP_POS_FRAMES, number):
-                        following = round(capture.get(cv2.CAP_PROP_POS_FRAMES))
-            while following <= number:
-                if not _grab(capture):
+                        reached = round(capture.get(cv2.CAP_PROP_POS_FRAMES)) - 1
+            while reached < number:
+                following = reached + 1
+                if _grab(capture):
+                    reached = max(following, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
+                elif following and video.is_timed and video.num_frames - following <= _END_S * video.fps:
+                    reached = video.num_frames
+                else:
                     raise TruncatedVideoError(video, following)
-                following = 1 + max(following, _number_at(video, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
-            decoded, frame = capture.retrieve()
-            if not decoded:
-                raise TruncatedVideoError(video, number)
-            _check_size(video.path, video, frame, f" in frame {number}")
+            # Of a picture that cannot be decoded, the one before is near only if no frames are left out.
+            if reached == number or frame is None or is_sparse:
+                decoded, frame = capture.retrieve(frame if into_one else None)
+                if not decoded:
+                    raise TruncatedVideoError(video, number)
+                _check_size(video.path, video, frame, f" in frame {number}")
             yield number, frame
 
 

@@ -297,7 +297,9 @@ def read_text(path: Path | str) -> str:
         raise InputError(
             path, expected="UTF-8 text", found=f"an invalid byte at offset {error.start}"
         ) from error
-    check_no_nul(path, text)
+    # A NUL is of a damaged file, or of a text in UTF-16 or UTF-32.
+    if "\0" in text:
+        raise InputError(path, expected="UTF-8 text", found=f"a NUL at character {text.index(chr(0))}")
     return text
 
 
@@ -313,12 +315,6 @@ def check_kind(path: Path | str, expected: str) -> None:
         for first, (found, remedy) in _OTHERS.items():
             if start.startswith(first):
                 raise InputError(path, expected=expected, found=found, remedy=remedy)
-
-
-def check_no_nul(path: Path | str, text: str) -> None:
-    """Raise `InputError` for a NUL, which no text has: the file is damaged, or is text in UTF-16 or UTF-32."""
-    if "\0" in text:
-        raise InputError(path, expected="UTF-8 text", found=f"a NUL at character {text.index(chr(0))}")
 
 
 def check_file_name(name: str, where: object) -> str:

@@ -4,7 +4,7 @@ from .files import DroneRows, check_cells, from_rows, read_trajectories, write_a
 from .resampling import merged, resample, roll_pitch_yaw_deg, rotation_matrices
 from .row_streams import RowStream
 from .tracks import ARRAYS, Arrival, Status, Tracks, padded
-from .trajectories import QUANTITIES, Trajectories
+from .trajectories import QUANTITIES, Trajectories, timed_path
 
 __all__ = [
     "ARRAYS",
@@ -28,6 +28,7 @@ __all__ = [
     "roll_pitch_yaw_deg",
     "rotation_matrices",
     "summary_columns",
+    "timed_path",
     "write_ambiguity",
     "write_trajectories",
 ]

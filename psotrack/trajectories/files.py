@@ -8,8 +8,9 @@ position; rows and columns may have any order, and further columns are ignored.
 from __future__ import annotations
 
 import csv
+import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +24,11 @@ from psotrack.support import (
     LARGEST,
     MODERATE,
     atomic_write,
-    check_no_nul,
     first_repeat,
     first_repeated,
     first_true,
     has_negative_eigenvalue,
+    read_text,
     refuse_to_overwrite,
 )
 from psotrack.trajectories.columns import ALL_COLUMNS, PARTS, columns_of, is_known
@@ -172,17 +173,18 @@ def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
 
 
 def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(words_of(columns))
+    path.write_text(csv_text(columns), encoding="utf-8", newline="")
 
 
-def words_of(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> Iterator[tuple[str, ...]]:
-    """The words of each row of a CSV file."""
+def csv_text(columns: Mapping[str, Shaped[np.ndarray, "rows"]], *, header: bool = True) -> str:
+    """The rows of a CSV file, below the names of the columns if there is a header."""
     # NumPy writes the shortest digits that read back as the same number in the array's own precision.
     words = [np.where(is_known(column), column.astype(str), "") for column in columns.values()]
-    return zip(*words, strict=True)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([columns] if header else [])
+    writer.writerows(zip(*words, strict=True))
+    return text.getvalue()
 
 
 def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
@@ -203,26 +205,21 @@ def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]
 
 
 def _read_csv(path: Path) -> DroneRows:
+    reader = csv.reader(io.StringIO(read_text(path)), strict=True)
     lines: list[int] = []
     rows: list[list[str]] = []
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(_without_nul(path, file), strict=True)
-            header = [name.strip() for name in next(reader, [])]
-            _check_columns(path, header)
-            for row in reader:
-                if len(row) not in (0, len(header)):
-                    expected = f"{len(header)} fields as in the first line"
-                    raise InputError(
-                        f"{path}, line {reader.line_num}", expected=expected, found=f"{len(row)}"
-                    )
-                if row:
-                    lines.append(reader.line_num)
-                    rows.append(row)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, expected="a CSV table in UTF-8", found=f"{error}") from error
-    except OSError as error:
-        raise InputError(path, expected="a readable file", found=f"{error.strerror}") from error
+        header = [name.strip() for name in next(reader, [])]
+        _check_columns(path, header)
+        for row in reader:
+            if len(row) not in (0, len(header)):
+                expected = f"{len(header)} fields as in the first line"
+                raise InputError(f"{path}, line {reader.line_num}", expected=expected, found=f"{len(row)}")
+            if row:
+                lines.append(reader.line_num)
+                rows.append(row)
+    except csv.Error as error:
+        raise InputError(path, expected="a CSV table", found=f"{error}") from error
 
     def number(line: int, word: str, name: str) -> float:
         try:
@@ -241,13 +238,6 @@ def _read_csv(path: Path) -> DroneRows:
         else:
             columns[name] = np.array([number(*item, name) for item in zip(lines, words, strict=True)], float)
     return DroneRows(columns, lambda row: f"{path}, line {lines[row]}")
-
-
-def _without_nul(path: Path, lines: Iterable[str]) -> Iterator[str]:
-    """The lines of a text, which are checked one by one, because tracks may be large."""
-    for line in lines:
-        check_no_nul(path, line)
-        yield line
 
 
 def _read_parquet(path: Path) -> DroneRows:

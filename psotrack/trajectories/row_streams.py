@@ -6,14 +6,12 @@ The bytes of the CSV file are those of `write_trajectories` for the same rows. I
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 from pathlib import Path
 
 from psotrack.errors import InputError, OutputError
 from psotrack.support import refuse_to_overwrite
 from psotrack.trajectories.columns import columns_of
-from psotrack.trajectories.files import words_of
+from psotrack.trajectories.files import csv_text
 from psotrack.trajectories.trajectories import Trajectories
 
 
@@ -56,13 +54,7 @@ class RowStream:
 
     def write(self, frame: Trajectories) -> None:
         """Add the rows of a frame, or of some frames, that come after those before."""
-        columns = columns_of(frame)
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        if not self._num_bytes:
-            writer.writerow(columns)
-        writer.writerows(words_of(columns))
-        rows = text.getvalue().encode()
+        rows = csv_text(columns_of(frame), header=not self._num_bytes).encode()
         try:
             if self._replaces:
                 self._file.truncate(0)

@@ -28,6 +28,8 @@ QUANTITIES: dict[str, tuple[int, ...]] = {
     "covariance_m2": (3, 3),
     "relative_covariance_m2": (3, 3),
 }
+#: Orientations that are the identity in every row, up to rounding of text, say that no orientation is known.
+_IDENTITY = 1e-9
 #: Largest asymmetry of a covariance relative to its largest element: about a hundred roundings of float32.
 SYMMETRY = 1e-5
 
@@ -154,6 +156,28 @@ class Trajectories:
         """These trajectories with other values, and all quantities changed."""
         changed: dict[str, Any] = {name: change(value) for name, value in self.quantities().items()}
         return replace(self, **values, **changed)
+
+
+def timed_path(
+    name: str,
+    time_s: Float[np.ndarray, "rows"],
+    position_m: Float[np.ndarray, "rows 3"],
+    orientation_wxyz: Float[np.ndarray, "rows 4"],
+    covariance_m2: Float[np.ndarray, "rows 3 3"] | None = None,
+) -> Trajectories:
+    """The path of one drone, with a frame for each time at which it was seen, seconds, increasing.
+
+    Orientations that are all the identity are left out: formats of poses write it where none is known.
+    """
+    turned = np.nanmax(np.abs(orientation_wxyz[:, 1:]), initial=0.0) > _IDENTITY
+    return Trajectories(
+        np.arange(len(time_s)),
+        time_s,
+        (name,),
+        position_m[:, None],
+        orientation_wxyz=orientation_wxyz[:, None] if turned else None,
+        covariance_m2=None if covariance_m2 is None else covariance_m2[:, None],
+    )
 
 
 def _check_symmetric(name: str, covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:

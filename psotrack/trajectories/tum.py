@@ -15,10 +15,9 @@ from psotrack.support import (
     first_repeat,
     first_true,
     read_numbers,
-    read_text,
     refuse_to_overwrite,
 )
-from psotrack.trajectories.trajectories import Trajectories
+from psotrack.trajectories.trajectories import Trajectories, timed_path
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
 _UNKNOWN = "# orientation unknown: 0 0 0 1 in every line"
@@ -55,6 +54,8 @@ def write_tum(folder: Path | str, trajectories: Trajectories, *, force: bool = F
 def read_tum(path: Path | str) -> Trajectories:
     """Read one TUM file with its own times; frames are numbered by line, and the drone has the file's name.
 
+    Orientations that are all the identity are unknown.
+
     Raises:
         InputError: the file cannot be read, a line is not a pose, or times do not increase. The message names file and
             line.
@@ -68,14 +69,7 @@ def read_tum(path: Path | str) -> Trajectories:
     if (row := first_repeat(time_s)) is not None:
         found = f"{time_s[row]} s after {time_s[row - 1]} s"
         raise read.error(row, expected="times that increase from line to line", found=found)
-    known = _UNKNOWN not in read_text(path).splitlines()
-    return Trajectories(
-        frame=np.arange(len(time_s)),
-        time_s=time_s,
-        drones=(path.stem,),
-        position_m=position_m[:, None],
-        orientation_wxyz=np.roll(quaternion / length, 1, axis=-1)[:, None] if known else None,
-    )
+    return timed_path(path.stem, time_s, position_m, np.roll(quaternion / length, 1, axis=-1))
 
 
 def tum_text(trajectories: Trajectories, drone: int) -> str:

@@ -30,9 +30,9 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage, boxes_in_camera, camera_frames
-from psotrack.recordings.exchange.timed_paths import interval_s, timed_path
+from psotrack.recordings.exchange.timed_paths import interval_s
 from psotrack.support import Report, check_file_name, first_repeat, first_true, read_numbers, write_rows
-from psotrack.trajectories import UNASSIGNED, DroneRows, Trajectories, from_rows
+from psotrack.trajectories import UNASSIGNED, DroneRows, Trajectories, from_rows, timed_path
 from psotrack.trajectories.association import align, fixed_identity
 
 POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"

@@ -6,7 +6,7 @@ frame from frame 0 on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -27,7 +27,7 @@ from psotrack.recordings.exchange.benchmark_files import (
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.recordings.exchange.json_files import read_json_tracks, write_json_tracks
 from psotrack.recordings.exchange.mcap_files import read_mcap, write_mcap
-from psotrack.recordings.exchange.timed_paths import interval_s, joined, on_clock, own_interval_s, timed_path
+from psotrack.recordings.exchange.timed_paths import interval_s, joined, on_clock, own_interval_s
 from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
 from psotrack.support import (
     Report,
@@ -183,25 +183,16 @@ def _read_folder(path: Path, recording: Recording | None) -> Trajectories:
     if any(path.glob("*.mcap")):
         return read_mcap(path, recording)
     if files := sorted(path.glob("*.tum")):
-        return _read_tum(path, files, recording)
+        return joined(path, [read_tum(file) for file in files], recording)
     folder = path / POSES if (path / POSES).is_dir() else path
     files = [file for file in sorted(folder.glob("*.txt")) if not file.stem.endswith("times")]
     counts = {len(number_words(first_line(file))) for file in files}
     if counts == {_TUM}:
-        return _read_tum(path, files, recording)
+        return joined(path, [read_tum(file) for file in files], recording)
     if counts == {_KITTI}:
         return joined(path, [read_kitti(file, recording) for file in files], recording)
     found = "files of boxes alone" if (path / "trackers").is_dir() else "a folder without them"
     raise InputError(path, expected=_KINDS, found=found)
-
-
-def _read_tum(where: Path, files: Sequence[Path], recording: Recording | None) -> Trajectories:
-    paths = []
-    for file in files:
-        read = read_tum(file)
-        turns = None if read.orientation_wxyz is None else read.orientation_wxyz[:, 0]
-        paths.append(timed_path(file.stem, read.time_s, read.position_m[:, 0], turns))
-    return joined(where, paths, recording)
 
 
 def _read_table(path: Path, recording: Recording | None) -> Trajectories:
@@ -221,7 +212,7 @@ def _read_text(path: Path, recording: Recording | None) -> Trajectories:
     if "," in line or count == 10:
         return read_mot_positions(path, recording)
     if count == _TUM:
-        return _read_tum(path, [path], recording)
+        return joined(path, [read_tum(path)], recording)
     if count == _KITTI:
         return joined(path, [read_kitti(path, recording)], recording)
     raise InputError(
@@ -236,7 +227,7 @@ _READERS: dict[str, Read] = {
     ".csv": _read_csv,
     ".parquet": _read_table,
     ".json": lambda path, recording: on_clock(path, read_json_tracks(path), recording),
-    ".tum": lambda path, recording: _read_tum(path, [path], recording),
+    ".tum": lambda path, recording: joined(path, [read_tum(path)], recording),
     ".txt": _read_text,
     ".c3d": read_c3d_tracks,
     ".mcap": read_mcap,

@@ -36,9 +36,9 @@ from psotrack.errors import InputError, SettingsError, install_command
 from psotrack.geometry import Camera
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, read_frames
 from psotrack.recordings.exchange.camera_boxes import Footage, camera_frames
-from psotrack.recordings.exchange.timed_paths import joined, timed_path
+from psotrack.recordings.exchange.timed_paths import joined
 from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat
-from psotrack.trajectories import Trajectories
+from psotrack.trajectories import Trajectories, timed_path
 
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"

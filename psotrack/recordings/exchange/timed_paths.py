@@ -21,32 +21,6 @@ _SAME = 0.02
 #: Longest gap between two samples over which positions are interpolated, in intervals between samples: one missing
 #: sample is a gap, and stays one.
 _GAP = 1.5
-#: Orientations that are the identity in every row, up to rounding of text, say that no orientation is known.
-_IDENTITY = 1e-9
-
-
-def timed_path(
-    name: str,
-    time_s: Float[np.ndarray, "rows"],
-    position_m: Float[np.ndarray, "rows 3"],
-    orientation_wxyz: Float[np.ndarray, "rows 4"] | None,
-    covariance_m2: Float[np.ndarray, "rows 3 3"] | None = None,
-) -> Trajectories:
-    """The path of one drone, with a frame for each time at which it was seen, seconds, increasing.
-
-    Orientations that are all the identity are left out: formats of poses write it where none is known.
-    """
-    turned = (
-        orientation_wxyz is not None and np.nanmax(np.abs(orientation_wxyz[:, 1:]), initial=0.0) > _IDENTITY
-    )
-    return Trajectories(
-        np.arange(len(time_s)),
-        time_s,
-        (name,),
-        position_m[:, None],
-        orientation_wxyz=orientation_wxyz[:, None] if orientation_wxyz is not None and turned else None,
-        covariance_m2=None if covariance_m2 is None else covariance_m2[:, None],
-    )
 
 
 def interval_s(trajectories: Trajectories) -> float:
@@ -75,7 +49,7 @@ def joined(where: object, paths: Sequence[Trajectories], recording: Recording | 
 
     Args:
         where: the file or folder, for messages.
-        paths: at least one path, of `timed_path`.
+        paths: at least one path, of `trajectories.timed_path`.
         recording: the recording, or None if none is known.
 
     Raises:

@@ -16,6 +16,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from psotrack.errors import InputError
 
+#: A cross in its own frame, and its recorded markers in the world, metres; NaN if a marker is not seen.
+Cross = Float[np.ndarray, "markers 3"]
+Seen = Float[np.ndarray, "frames markers 3"]
+_Points = Float[np.ndarray, "frames 3"]
+_Candidates = Float[np.ndarray, "points 3"]
+_Frames = Bool[np.ndarray, "frames"]
+#: Centroids in the world, metres; unit quaternions from cross to world; and where the pose is interpolated over a gap.
+Poses = tuple[_Points, Float[np.ndarray, "frames 4"], _Frames]
+
 #: Smallest root mean square distance of markers from a line, metres; nearer markers do not determine the turn about it.
 _LINE_M = 0.005
 #: Noise of a motion-capture system, metres, added where residuals are compared.
@@ -42,13 +51,11 @@ class RigidFit:
     """
 
     rotation: Float[np.ndarray, "frames 3 3"]
-    position_m: Float[np.ndarray, "frames 3"]
+    position_m: _Points
     residual_m: Float[np.ndarray, "frames"]
 
 
-def fit_rigid(
-    markers_m: Float[np.ndarray, "markers 3"], position_m: Float[np.ndarray, "frames markers 3"]
-) -> RigidFit:
+def fit_rigid(markers_m: Cross, position_m: Seen) -> RigidFit:
     """Least-squares poses of a body in every frame, from its seen markers.
 
     Args:
@@ -79,9 +86,7 @@ def fit_rigid(
     )
 
 
-def learn_cross(
-    position_m: Float[np.ndarray, "frames markers 3"], name: str = ""
-) -> Float[np.ndarray, "markers 3"]:
+def learn_cross(position_m: Seen, name: str = "") -> Cross:
     """Learn the shape of a recorded cross: a generalised Procrustes mean over the frames whose markers fit.
 
     The mean starts from the medians of all distances. Swapped labels and stray markers in less than half of the frames
@@ -112,9 +117,7 @@ def learn_cross(
     return markers_m @ axes.T
 
 
-def _shape_from_distances(
-    position_m: Float[np.ndarray, "frames markers 3"], name: str
-) -> Float[np.ndarray, "markers 3"]:
+def _shape_from_distances(position_m: Seen, name: str) -> Cross:
     """Shape with the median distances, by classical scaling (Torgerson 1952); it may be a mirror image."""
     distances_m = np.linalg.norm(position_m[:, :, None] - position_m[:, None], axis=-1)
     together = np.isfinite(distances_m).any(axis=0)
@@ -132,9 +135,7 @@ def _shape_from_distances(
     return np.pad(shape - shape.mean(axis=0), ((0, 0), (0, max(0, 3 - len(squares)))))
 
 
-def _better_mirror_image(
-    markers_m: Float[np.ndarray, "markers 3"], position_m: Float[np.ndarray, "frames markers 3"]
-) -> tuple[Float[np.ndarray, "markers 3"], RigidFit] | None:
+def _better_mirror_image(markers_m: Cross, position_m: Seen) -> tuple[Cross, RigidFit] | None:
     """The better of a shape and its mirror image, with its fits; None if the markers lie on a line."""
     mirrored_m = markers_m * [1.0, 1.0, -1.0]
     fits = [(shape_m, fit_rigid(shape_m, position_m)) for shape_m in (markers_m, mirrored_m)]
@@ -143,13 +144,9 @@ def _better_mirror_image(
     return min(fits, key=lambda fit: float(np.nanmedian(fit[1].residual_m)))
 
 
-def _mean_shape(
-    markers_m: Float[np.ndarray, "markers 3"],
-    pose: RigidFit,
-    position_m: Float[np.ndarray, "frames markers 3"],
-) -> Float[np.ndarray, "markers 3"]:
+def _mean_shape(markers_m: Cross, pose: RigidFit, position_m: Seen) -> Cross:
     """Mean of the markers in the body's frame over the frames that fit, with the centroid at the origin."""
-    fitting: Bool[np.ndarray, "frames"] = within_usual_residual(pose.residual_m)
+    fitting: _Frames = within_usual_residual(pose.residual_m)
     in_body = np.einsum(
         "fji,fmj->fmi", pose.rotation[fitting], position_m[fitting] - pose.position_m[fitting, None]
     )
@@ -160,14 +157,14 @@ def _mean_shape(
     return mean_m - mean_m.mean(axis=0)
 
 
-def within_usual_residual(residual_m: Float[np.ndarray, "frames"]) -> Bool[np.ndarray, "frames"]:
+def within_usual_residual(residual_m: Float[np.ndarray, "frames"]) -> _Frames:
     """True where a residual is at most three times the recording's median plus noise; False where it is NaN."""
     known = residual_m[np.isfinite(residual_m)]
     limit_m = 3 * np.median(known) + NOISE_M if len(known) else 0.0
     return np.isfinite(residual_m) & (residual_m <= limit_m)
 
 
-def _axes(markers_m: Float[np.ndarray, "markers 3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def _axes(markers_m: Cross, up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """(3, 3), axes of the cross's own frame as rows.
 
     The axes depend on the shape and the upward direction only, so that two recordings give the same frame.
@@ -190,11 +187,7 @@ _MAX_GAP_S = 0.5
 _SLOPE_S = 0.1
 
 
-def cross_poses(
-    markers_m: Float[np.ndarray, "markers 3"],
-    position_m: Float[np.ndarray, "frames markers 3"],
-    rate_hz: float,
-) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"], Bool[np.ndarray, "frames"]]:
+def cross_poses(markers_m: Cross, position_m: Seen, rate_hz: float) -> Poses:
     """Poses of a cross in every frame of a recording, by least squares; three seen markers are enough.
 
     Frames that do not fit, even with corrected labels, are gaps. Gaps up to half a second are bridged by a cubic for
@@ -218,9 +211,7 @@ def cross_poses(
     return _bridge_gaps(fits.position_m, orientation_wxyz, rate_hz)
 
 
-def correct_labels(
-    markers_m: Float[np.ndarray, "markers 3"], position_m: Float[np.ndarray, "frames markers 3"]
-) -> Float[np.ndarray, "frames markers 3"]:
+def correct_labels(markers_m: Cross, position_m: Seen) -> Seen:
     """(frames, markers, 3), markers with corrected labels and without stray points; NaN in frames without a fit."""
     residual_m = fit_rigid(markers_m, position_m).residual_m
     corrected_m = position_m.copy()
@@ -232,9 +223,7 @@ def correct_labels(
     return corrected_m
 
 
-def identify_markers(
-    markers_m: Float[np.ndarray, "markers 3"], points_m: Float[np.ndarray, "points 3"]
-) -> Float[np.ndarray, "markers 3"]:
+def identify_markers(markers_m: Cross, points_m: _Candidates) -> Cross:
     """Find the markers of a cross among points in any order, from the distances alone.
 
     Returns:
@@ -256,9 +245,7 @@ def identify_markers(
     return np.full_like(markers_m, np.nan)
 
 
-def _labellings(
-    markers_m: Float[np.ndarray, "markers 3"], points_m: Float[np.ndarray, "points 3"], count: int
-) -> Int[np.ndarray, "labellings markers"]:
+def _labellings(markers_m: Cross, points_m: _Candidates, count: int) -> Int[np.ndarray, "labellings markers"]:
     """The point of each marker, for all labellings of `count` markers or more in which the distances agree.
 
     A marker without a point has the index after the last point.
@@ -280,15 +267,13 @@ def _labellings(
     return found
 
 
-def _distances(points_m: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points points"]:
+def _distances(points_m: _Candidates) -> Float[np.ndarray, "points points"]:
     return np.linalg.norm(points_m[:, None] - points_m, axis=-1)
 
 
 def _bridge_gaps(
-    position_m: Float[np.ndarray, "frames 3"],
-    orientation_wxyz: Float[np.ndarray, "frames 4"],
-    rate_hz: float,
-) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"], Bool[np.ndarray, "frames"]]:
+    position_m: _Points, orientation_wxyz: Float[np.ndarray, "frames 4"], rate_hz: float
+) -> Poses:
     """Poses with short gaps filled, and the frames that were filled."""
     bridged_m, bridged_wxyz = position_m.copy(), orientation_wxyz.copy()
     placed = np.flatnonzero(np.isfinite(position_m[:, 0]))
@@ -313,10 +298,7 @@ def _bridge_gaps(
 
 
 def _slope(
-    position_m: Float[np.ndarray, "frames 3"],
-    frames: Int[np.ndarray, "near"],
-    at: np.integer,
-    chord: Float[np.ndarray, "3"],
+    position_m: _Points, frames: Int[np.ndarray, "near"], at: np.integer, chord: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
     """Velocity at one end of a gap, metres per frame; the mean velocity over the gap if only one pose is near."""
     if len(frames) < 2:
