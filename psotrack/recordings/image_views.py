@@ -27,6 +27,8 @@ from psotrack.recordings.timing import nearest_frames
 from psotrack.support import as_written
 from psotrack.trajectories import Trajectories
 
+_Vectors = Float[np.ndarray, "frames drones 3"]
+_Sizes = Float[np.ndarray, "drones 3"]
 #: Number of instants that are projected together, which bounds the memory of long flights.
 _TOGETHER = 5000
 #: Number of points on the outline of an ellipse.
@@ -54,9 +56,7 @@ class ImageViews:
     shape_px2: Float[np.ndarray, "frames drones cameras 2 2"]
 
 
-def view_in_images(
-    recording: Recording, trajectories: Trajectories, size_m: Float[np.ndarray, "drones 3"]
-) -> ImageViews:
+def view_in_images(recording: Recording, trajectories: Trajectories, size_m: _Sizes) -> ImageViews:
     """The drones in the images of every camera.
 
     The image of an ellipsoid with covariance C is the ellipse of J C Jᵀ with the projection's derivative J at the
@@ -103,9 +103,9 @@ def ellipse_outlines_px(
 @as_written()
 def _boxes_px(
     recording: Recording,
-    position_m: Float[np.ndarray, "frames drones 3"],
+    position_m: _Vectors,
     moved_m: Float[np.ndarray, "frames drones cameras 3"],
-    size_m: Float[np.ndarray, "drones 3"],
+    size_m: _Sizes,
     there: Bool[np.ndarray, "frames drones cameras"],
 ) -> Float[np.ndarray, "frames drones cameras 4"]:
     """Boxes of drones that have moved since the instant; NaN where they are not shown."""
@@ -128,7 +128,7 @@ def _boxes_px(
 
 def _exposures_s(
     recording: Recording,
-    position_m: Float[np.ndarray, "frames drones 3"],
+    position_m: _Vectors,
     offset_s: Float[np.ndarray, "frames cameras"],
 ) -> Float[np.ndarray, "frames drones cameras"]:
     """Time from each instant to the exposure of each drone in each camera, seconds; 0 where it is not shown."""
@@ -139,7 +139,7 @@ def _exposures_s(
     return offset_s[:, None] + line_time_s * (row_px - height_px / 2)
 
 
-def _velocities_m_s(trajectories: Trajectories) -> Float[np.ndarray, "frames drones 3"]:
+def _velocities_m_s(trajectories: Trajectories) -> _Vectors:
     """Velocities of the tracks, or differences of their positions; 0 where neither is known, m/s."""
     if trajectories.velocity_m_s is not None:
         return np.nan_to_num(trajectories.velocity_m_s)

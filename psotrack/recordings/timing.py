@@ -17,6 +17,8 @@ from jaxtyping import Bool, Float, Int
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.support import first_repeat, read_table, short_repr
 
+_Times = Float[np.ndarray, "instants"]
+_Rows = Float[np.ndarray, "rows"]
 #: Largest distance of a frame from an instant at which the frame is shown, in intervals of the frame's camera: half an
 #: interval, and a tenth for times that jitter.
 REACH = 0.6
@@ -194,7 +196,7 @@ class Timeline:
 
     cameras: tuple[str, ...]
     rate_hz: float
-    time_s: Float[np.ndarray, "instants"]
+    time_s: _Times
     frame: Int[np.ndarray, "instants cameras"]
     offset_s: Float[np.ndarray, "instants cameras"]
     line_time_s: Float[np.ndarray, "cameras"] | None = None
@@ -233,19 +235,19 @@ class Timeline:
             share[there, camera] = 1 / count[which]
         return share
 
-    def has(self, number: Int[np.ndarray, "rows"], time_s: Float[np.ndarray, "rows"]) -> bool:
+    def has(self, number: Int[np.ndarray, "rows"], time_s: _Rows) -> bool:
         """Whether the instants of these numbers have these times, seconds, in files of tracks."""
         if not len(number) or number[-1] >= self.num_instants:
             return False
         limit = np.clip(_ROUNDED_S * self.rate_hz, *_ROUNDED_SHARES)
         return bool(np.abs(self.time_s[number] - time_s).max() * self.rate_hz <= limit)
 
-    def numbers_of(self, time_s: Float[np.ndarray, "rows"]) -> Int[np.ndarray, "rows"] | None:
+    def numbers_of(self, time_s: _Rows) -> Int[np.ndarray, "rows"] | None:
         """(rows,), numbers of the instants with these increasing times, seconds; None unless each has its own."""
         number = _nearest(self.time_s, time_s)
         return number if self.has(number, time_s) and (np.diff(number) > 0).all() else None
 
-    def unit_of(self, time_s: Float[np.ndarray, "rows"]) -> str:
+    def unit_of(self, time_s: _Rows) -> str:
         """The unit that increasing times of a file seem to have, in the plural; empty where it may be the second.
 
         Hardly any of such times is within the recording, and their rate is nearer to a thousandth of the recording's.
@@ -340,9 +342,7 @@ def _of_nearest_frames(names: tuple[str, ...], times: list[FrameTimes], rate_hz:
     return Timeline(names, rate_hz, time_s[:stop], frame[:stop], offset_s[:stop])
 
 
-def nearest_frames(
-    times: FrameTimes, at_s: Float[np.ndarray, "instants"]
-) -> tuple[Int[np.ndarray, "instants"], Float[np.ndarray, "instants"]]:
+def nearest_frames(times: FrameTimes, at_s: _Times) -> tuple[Int[np.ndarray, "instants"], _Times]:
     """The frame of a camera that is nearest to each instant.
 
     Args:

@@ -23,11 +23,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.errors import InputError, SettingsError, check_positive, system_errors
 from psotrack.recordings.image_files import check_pixels, depth_of, read_image, silence_opencv
 from psotrack.recordings.timing import MOST_INSTANTS, FrameTimes
 from psotrack.support import check_kind, digest_file, digest_record
 
+_Frame = UInt8[np.ndarray, "height width 3"]
 _logger = logging.getLogger(__name__)
 #: Largest number of images of which the depth is read.
 _READ_IMAGES = 5
@@ -251,9 +252,7 @@ def digest_video(video: VideoInfo) -> str:
     return digest_record([digest_file(path, expected="a readable image") for path in video.images])
 
 
-def read_frames(
-    video: VideoInfo, step: int = 1, *, into_one: bool = False
-) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def read_frames(video: VideoInfo, step: int = 1, *, into_one: bool = False) -> Iterator[_Frame]:
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
     The codec must decode the frames in between, but they are not converted to BGR. A frame that cannot be decoded
@@ -281,9 +280,7 @@ def _number_at(video: VideoInfo, time_s: float) -> int:
     return bisect_left(video.times_s, time_s - _SAME_S) if video.times_s else round(time_s * video.fps)
 
 
-def read_frames_at(
-    video: VideoInfo, numbers: Sequence[int]
-) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+def read_frames_at(video: VideoInfo, numbers: Sequence[int]) -> Iterator[tuple[int, _Frame]]:
     """Yield chosen frames of a video and their numbers: BGR, (height, width, 3), uint8.
 
     Frames far ahead are sought, frames nearby are reached by decoding. Of a video that was not finished, which has no
@@ -301,7 +298,7 @@ def read_frames_at(
 
 def _read(
     video: VideoInfo, numbers: Sequence[int], *, into_one: bool = False, is_sparse: bool = False
-) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+) -> Iterator[tuple[int, _Frame]]:
     """Yield chosen frames and their numbers; of sparse ones, those far ahead are sought."""
     if video.images:
         for number in numbers:
@@ -309,7 +306,7 @@ def _read(
             _check_size(video.images[number], video, image)
             yield number, image
         return
-    frame: UInt8[np.ndarray, "height width 3"] | None = None
+    frame: _Frame | None = None
     reached = -1
     with open_capture(video.path) as capture:
         for number in numbers:
@@ -335,9 +332,7 @@ def _read(
             yield number, frame
 
 
-def read_near(
-    video: VideoInfo, places: Sequence[int]
-) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+def read_near(video: VideoInfo, places: Sequence[int]) -> Iterator[tuple[int, _Frame]]:
     """Yield frames near some places, and their numbers, without decoding the video up to there.
 
     A frame of a video file is one shortly after the key frame that is nearest to the place. Places with the same key
@@ -376,9 +371,7 @@ def _key_frames(video: VideoInfo) -> list[int]:
         return [index for index in frames if capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME)]
 
 
-def _check_size(
-    path: Path, video: VideoInfo, frame: UInt8[np.ndarray, "height width 3"], where: str = ""
-) -> None:
+def _check_size(path: Path, video: VideoInfo, frame: _Frame, where: str = "") -> None:
     width, height = video.image_size_wh
     if frame.shape != (height, width, 3):
         expected = f"{width} x {height} pixels"
@@ -394,13 +387,9 @@ def open_capture(path: Path) -> Iterator[cv2.VideoCapture]:
     Raises:
         InputError: the video cannot be opened.
     """
-    try:
-        with path.open("rb") as file:
-            empty = not file.read(1)
-    except OSError as error:
-        raise InputError(path, expected="a video", found=(error.strerror or str(error)).lower()) from error
-    if empty:
-        raise InputError(path, expected="a video", found="an empty file")
+    with system_errors(path, "a video"), path.open("rb") as file:
+        if not file.read(1):
+            raise InputError(path, expected="a video", found="an empty file")
     with silence_opencv():
         # As many threads as OpenCV may use: one in a worker process, so that processes do not compete for processors.
         threads = (cv2.CAP_PROP_N_THREADS, max(1, cv2.getNumThreads()))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from filelock import LeaseCompromise, SoftFileLease, Timeout
 
-from psotrack.errors import OutputError
+from psotrack.errors import OutputError, system_errors
 
 logger = logging.getLogger(__name__)
 
@@ -50,15 +50,9 @@ class Locks:
             OutputError: the folder cannot be written, or the disk is full.
         """
         lease = self._lease(path)
-        try:
+        remedy = "earlier results are unchanged"
+        with system_errors(path.parent, "a folder that can be written", OutputError, remedy):
             is_held = not lease.is_locked and _acquire(lease)
-        except OSError as error:
-            raise OutputError(
-                path.parent,
-                expected="a folder that can be written",
-                found=error.strerror or f"{error}",
-                remedy="earlier results are unchanged",
-            ) from error
         try:
             yield is_held
         finally:

@@ -34,7 +34,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, system_errors
 from psotrack.support import Locks, atomic_write, digest_record, read_json, write_json
 from psotrack.sweeps.tables import DESCRIBING, natural
 
@@ -43,10 +43,6 @@ logger = logging.getLogger(__name__)
 _KEY = b"psotrack.digest"
 #: The digest's place before the digest is known.
 _EMPTY = b"0" * 64
-
-
-class DamagedError(InputError):
-    """A file was changed or cut short after it was written."""
 
 
 def write_parquet(path: Path, table: pd.DataFrame) -> None:
@@ -65,23 +61,19 @@ def write_parquet(path: Path, table: pd.DataFrame) -> None:
         temporary.write_bytes(before + _digest(before, after) + after)
 
 
-def read_parquet(path: Path) -> pd.DataFrame:
-    """Read a table.
+def read_parquet(path: Path) -> pd.DataFrame | None:
+    """Read a table; None where there is no file.
 
     Raises:
-        DamagedError: the file was changed or cut short after it was written.
-        FileNotFoundError: the file does not exist.
-        InputError: the file cannot be read.
+        InputError: the file cannot be read, or was changed or cut short after it was written.
     """
-    try:
+    if not path.exists():
+        return None
+    with system_errors(path, "a file to read"):
         content = path.read_bytes()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise InputError(path, expected="a file to read", found=error.strerror or f"{error}") from error
     before, digest, after = _parts(content)
     if digest != _digest(before, after):
-        raise DamagedError(
+        raise InputError(
             path,
             expected="an undamaged file of a sweep",
             found="a file that was changed after it was written",
@@ -180,8 +172,8 @@ class Store:
         wanted = dict.fromkeys(self._last_keys()) if seeds is None else seeds
         parts = []
         for key, some in wanted.items():
-            with contextlib.suppress(FileNotFoundError):
-                rows = read_parquet(self._path(key))
+            rows = read_parquet(self._path(key))
+            if rows is not None:
                 parts.append(rows if some is None else rows[rows["seed"].isin(list(some))])
         if not parts:
             raise InputError(self.folder, expected="results of a sweep", found="no finished cell")
@@ -234,9 +226,7 @@ class Store:
         """Rows of a cell as they are stored; None without such a file, and with a warning for a damaged file."""
         try:
             return read_parquet(self._path(key))
-        except FileNotFoundError:
-            return None
-        except DamagedError:
+        except InputError:
             logger.warning("%s: damaged rows of a cell; a sweep runs the cell again", self._path(key))
             return None
 

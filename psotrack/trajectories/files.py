@@ -38,6 +38,8 @@ from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 if TYPE_CHECKING:
     import pyarrow as pa
 
+_Column = Shaped[np.ndarray, "rows"]
+_Columns = Mapping[str, _Column]
 #: Version of the columns' names, units and words; a change of meaning needs a new version.
 SCHEMA_VERSION = 1
 
@@ -139,7 +141,7 @@ class DroneRows:
         place: gives file and line of a row, for messages.
     """
 
-    columns: Mapping[str, Shaped[np.ndarray, "rows"]]
+    columns: _Columns
     place: Callable[[int], str]
 
     def error(self, row: int, *, expected: str, found: object) -> InputError:
@@ -172,11 +174,11 @@ def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
 # Writing
 
 
-def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
+def _write_csv(path: Path, columns: _Columns) -> None:
     path.write_text(csv_text(columns), encoding="utf-8", newline="")
 
 
-def csv_text(columns: Mapping[str, Shaped[np.ndarray, "rows"]], *, header: bool = True) -> str:
+def csv_text(columns: _Columns, *, header: bool = True) -> str:
     """The rows of a CSV file, below the names of the columns if there is a header."""
     # NumPy writes the shortest digits that read back as the same number in the array's own precision.
     words = [np.where(is_known(column), column.astype(str), "") for column in columns.values()]
@@ -187,7 +189,7 @@ def csv_text(columns: Mapping[str, Shaped[np.ndarray, "rows"]], *, header: bool 
     return text.getvalue()
 
 
-def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
+def _write_parquet(path: Path, columns: _Columns) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -260,7 +262,7 @@ def _read_parquet(path: Path) -> DroneRows:
     return DroneRows(columns, lambda row: f"{path}, row {row + 1}")
 
 
-def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray, "rows"]:
+def _parquet_column(path: Path, table: pa.Table, name: str) -> _Column:
     import pyarrow as pa
 
     column = table.column(name)
@@ -329,7 +331,7 @@ def from_rows(path: Path, rows: DroneRows, fps: float | None = None) -> Trajecto
     )
 
 
-def _has_any(column: Shaped[np.ndarray, "rows"]) -> bool:
+def _has_any(column: _Column) -> bool:
     """Whether some value of a column is known."""
     return column.dtype == object or bool(np.isfinite(column).any())
 

@@ -17,6 +17,8 @@ from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 
 _Times = Float[np.ndarray, "times"]
 _Samples = Float[np.ndarray, "samples"]
+_Frames = Int[np.ndarray, "frames"]
+_Instants = Float[np.ndarray, "frames"]
 #: Longest gap over which positions are interpolated, seconds; for slow trajectories 1.5 sample intervals.
 MAX_GAP_S = 0.1
 #: Largest turn between two samples between which orientations are interpolated, radians.
@@ -29,8 +31,8 @@ _At = Callable[[_Times], np.ndarray]
 
 def resample(
     trajectories: Trajectories,
-    frame: Int[np.ndarray, "frames"],
-    time_s: Float[np.ndarray, "frames"],
+    frame: _Frames,
+    time_s: _Instants,
     *,
     later_s: float = 0.0,
     gap_s: float | None = None,
@@ -85,7 +87,7 @@ def _turned(
 def merged(
     parts: Sequence[Trajectories],
     frames: Sequence[Int[np.ndarray, "_"]],
-    time_of: Callable[[Int[np.ndarray, "frames"]], Float[np.ndarray, "frames"]],
+    time_of: Callable[[_Frames], _Instants],
 ) -> Trajectories:
     """One set of trajectories from those of different drones, in the frames that some of them have; NaN where unknown.
 

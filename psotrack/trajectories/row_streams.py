@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from psotrack.errors import InputError, OutputError
+from psotrack.errors import InputError, OutputError, system_errors
 from psotrack.support import refuse_to_overwrite
 from psotrack.trajectories.columns import columns_of
 from psotrack.trajectories.files import csv_text
@@ -42,20 +42,18 @@ class RowStream:
         self._num_bytes = 0
 
     def __enter__(self) -> RowStream:
-        try:
+        with self._errors():
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._replaces = self._path.is_file()
             # Appending, because an older file stays until the first row. Not buffered: what a full disk does not take
             # is known at once, and not written later.
             self._file = self._path.open("ab", buffering=0)
-        except OSError as error:
-            raise self._error(error) from error
         return self
 
     def write(self, frame: Trajectories) -> None:
         """Add the rows of a frame, or of some frames, that come after those before."""
         rows = csv_text(columns_of(frame), header=not self._num_bytes).encode()
-        try:
+        with self._errors():
             if self._replaces:
                 self._file.truncate(0)
                 self._replaces = False
@@ -63,30 +61,24 @@ class RowStream:
             if not self._num_bytes and self._record is not None and self._record.is_file():
                 self._record.resolve().unlink()
             rest = memoryview(rows)
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except OSError as error:
-            # A row that is cut off would make the table unreadable.
-            with contextlib.suppress(OSError):
-                self._file.truncate(self._num_bytes)
-            raise self._error(error) from error
+            try:
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+            except OSError:
+                # A row that is cut off would make the table unreadable.
+                with contextlib.suppress(OSError):
+                    self._file.truncate(self._num_bytes)
+                raise
         self._num_bytes += len(rows)
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        try:
+        with self._errors():
             self._file.close()
-        except OSError as failed:
-            raise self._error(failed) from failed
         # An empty file would only be in the way of the next session. Links to devices stay, and so does an older file
         # after an error.
         if not self._num_bytes and self._path.is_file() and not (self._replaces and kind):
             self._path.unlink()
 
-    def _error(self, error: OSError) -> OutputError:
-        where = f"the rows that were written before stay in {self._path.name}"
-        return OutputError(
-            self._path,
-            expected="to write rows",
-            found=(error.strerror or f"{error}").lower(),
-            remedy=where if self._num_bytes else "",
-        )
+    def _errors(self) -> contextlib.AbstractContextManager[None]:
+        kept = f"the rows that were written before stay in {self._path.name}" if self._num_bytes else ""
+        return system_errors(self._path, "to write rows", OutputError, kept)

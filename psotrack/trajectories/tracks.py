@@ -15,6 +15,10 @@ from jaxtyping import Float, Int
 
 from psotrack.support import short_repr
 
+Vectors = Float[np.ndarray, "frames drones 3"]
+Matrices = Float[np.ndarray, "frames drones 3 3"]
+Counts = Int[np.ndarray, "frames drones"]
+
 
 class Status(IntEnum):
     """Status of a drone in a frame."""
@@ -68,14 +72,14 @@ class Tracks:
         arrivals: drones that came after frame 0, or that came back.
     """
 
-    position_m: Float[np.ndarray, "frames drones 3"]
-    velocity_m_s: Float[np.ndarray, "frames drones 3"]
-    covariance_m2: Float[np.ndarray, "frames drones 3 3"]
-    measured_m: Float[np.ndarray, "frames drones 3"]
-    measured_covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+    position_m: Vectors
+    velocity_m_s: Vectors
+    covariance_m2: Matrices
+    measured_m: Vectors
+    measured_covariance_m2: Matrices
     fitness: Float[np.ndarray, "frames drones"]
-    num_cameras: Int[np.ndarray, "frames drones"]
-    status: Int[np.ndarray, "frames drones"]
+    num_cameras: Counts
+    status: Counts
     size_m: Float[np.ndarray, "drones 3"]
     size_frames: Int[np.ndarray, "drones 3"]
     arrivals: tuple[Arrival, ...] = ()
@@ -97,7 +101,7 @@ class Tracks:
         changed: dict[str, Any] = {name: change(name, getattr(self, name)) for name in ARRAYS}
         return replace(self, **changed)
 
-    def found_m(self) -> Float[np.ndarray, "frames drones 3"]:
+    def found_m(self) -> Vectors:
         """(frames, drones, 3), measured positions in float64; NaN in frames in which a drone was not found."""
         found = self.status == Status.TRACKED
         return np.where(found[..., None], np.asarray(self.measured_m, np.float64), np.nan)

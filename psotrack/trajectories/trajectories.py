@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from psotrack.errors import InputError
 from psotrack.support import html_block, short_repr
 from psotrack.trajectories.columns import data_frame, drones_html
-from psotrack.trajectories.tracks import Status
+from psotrack.trajectories.tracks import Counts, Matrices, Status, Vectors
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -59,14 +59,14 @@ class Trajectories:
     frame: Int[np.ndarray, "frames"]
     time_s: Float[np.ndarray, "frames"]
     drones: tuple[str, ...]
-    position_m: Float[np.ndarray, "frames drones 3"]
-    velocity_m_s: Float[np.ndarray, "frames drones 3"] | None = None
+    position_m: Vectors
+    velocity_m_s: Vectors | None = None
     orientation_wxyz: Float[np.ndarray, "frames drones 4"] | None = None
     fitness: Float[np.ndarray, "frames drones"] | None = None
-    num_cameras: Int[np.ndarray, "frames drones"] | None = None
-    status: Int[np.ndarray, "frames drones"] | None = None
-    covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None
-    relative_covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None = None
+    num_cameras: Counts | None = None
+    status: Counts | None = None
+    covariance_m2: Matrices | None = None
+    relative_covariance_m2: Matrices | None = None
 
     __repr__ = short_repr
 
@@ -180,7 +180,7 @@ def timed_path(
     )
 
 
-def _check_symmetric(name: str, covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:
+def _check_symmetric(name: str, covariance_m2: Matrices) -> None:
     """Raise `InputError` for matrices that are not symmetric up to the rounding of float32 sums; NaN passes."""
     asymmetry_m2 = np.abs(covariance_m2 - np.swapaxes(covariance_m2, -1, -2)).max(axis=(-2, -1))
     wrong = asymmetry_m2 > SYMMETRY * np.abs(covariance_m2).max(axis=(-2, -1))

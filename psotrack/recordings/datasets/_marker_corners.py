@@ -32,6 +32,7 @@ from psotrack.geometry.rig_files import UNITS_M
 from psotrack.recordings.datasets._poses import lengths_of
 from psotrack.support import Column, Table, TextRow, are_numbers, first_line, read_rows, write_rows
 
+_Corners = Float[np.ndarray, "4 3"]
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
 #: Names of the columns of a table without header, by their number.
 _UNNAMED = {13: ["id", *_CORNERS], 5: ["id", "corner", *"xyz"]}
@@ -61,11 +62,11 @@ class MarkerRow:
     """
 
     where: str
-    corners_m: Float[np.ndarray, "4 3"]
+    corners_m: _Corners
     std_m: float = 0.0
 
 
-def read_marker_corners(path: Path | str) -> dict[int, Float[np.ndarray, "4 3"]]:
+def read_marker_corners(path: Path | str) -> dict[int, _Corners]:
     """Read corners (4, 3) in the world, metres, by marker id.
 
     The shape of the markers is not checked here, but by `inside_out.marker_map`.
@@ -125,7 +126,7 @@ def split_label(label: str) -> tuple[int, int] | None:
 
 def write_marker_corners(
     path: Path | str,
-    corners_m: Mapping[int, Float[np.ndarray, "4 3"]],
+    corners_m: Mapping[int, _Corners],
     std_m: Mapping[int, float] | None = None,
 ) -> None:
     """Write corners (4, 3) in the world and, if given, their standard deviations along each axis, metres, by marker id.

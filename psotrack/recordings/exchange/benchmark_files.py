@@ -35,6 +35,7 @@ from psotrack.support import Report, check_file_name, first_repeat, first_true, 
 from psotrack.trajectories import UNASSIGNED, DroneRows, Trajectories, from_rows, timed_path
 from psotrack.trajectories.association import align, fixed_identity
 
+_Rows = Float[np.ndarray, "rows"]
 POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
 #: Largest difference of R R' from the identity: KITTI's own files have 7 digits.
 _ROTATION = 1e-4
@@ -87,7 +88,7 @@ def read_kitti(file: Path, recording: Recording | None) -> Trajectories:
     return timed_path(file.stem, _times(file, len(poses), recording), poses[:, :, 3], orientation)
 
 
-def _times(file: Path, count: int, recording: Recording | None) -> Float[np.ndarray, "rows"]:
+def _times(file: Path, count: int, recording: Recording | None) -> _Rows:
     beside = find_times(file)
     if beside is not None:
         read = read_numbers(beside, 1, "one time in seconds per line")
@@ -230,9 +231,7 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
     return from_rows(path, DroneRows(columns, lambda row: f"{path}, line {read.lines[order[row]]}"))
 
 
-def _times_of_rows(
-    path: Path, frame: Float[np.ndarray, "rows"], recording: Recording | None
-) -> Float[np.ndarray, "rows"]:
+def _times_of_rows(path: Path, frame: _Rows, recording: Recording | None) -> _Rows:
     """(rows,), times of the rows' frames, seconds."""
     info = path.with_name(INFO)
     fps = None

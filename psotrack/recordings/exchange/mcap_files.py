@@ -40,6 +40,8 @@ from psotrack.recordings.exchange.timed_paths import joined
 from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat
 from psotrack.trajectories import Trajectories, timed_path
 
+_Point = Float[np.ndarray, "3"]
+_Turn = Float[np.ndarray, "4"]
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -97,8 +99,8 @@ def header(time_ns: int, frame: str) -> dict[str, Any]:
 
 def pose_message(
     head: dict[str, Any],
-    position_m: Float[np.ndarray, "3"],
-    orientation_wxyz: Float[np.ndarray, "4"],
+    position_m: _Point,
+    orientation_wxyz: _Turn,
     covariance_m2: Float[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
     """A pose; orientation and covariance are NaN where they are not known.
@@ -117,15 +119,15 @@ def pose_message(
 def transform(
     head: dict[str, Any],
     child: str,
-    position_m: Float[np.ndarray, "3"],
-    orientation_wxyz: Float[np.ndarray, "4"],
+    position_m: _Point,
+    orientation_wxyz: _Turn,
 ) -> dict[str, Any]:
     """Where the coordinate frame `child` is; an unknown orientation, NaN, is the identity."""
     place = {"translation": _vector(position_m), "rotation": _quaternion(orientation_wxyz)}
     return {"header": head, "child_frame_id": child, "transform": place}
 
 
-def camera_pose(camera: Camera) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
+def camera_pose(camera: Camera) -> tuple[_Point, _Turn]:
     """Centre of a camera in the world, metres, and its orientation, camera to world, w first; z looks ahead."""
     R = np.asarray(camera.T_cam_world)[:3, :3]
     return np.asarray(camera.centre_world), Rotation.from_matrix(R.T).as_quat(scalar_first=True)
@@ -164,11 +166,11 @@ def camera_message(head: dict[str, Any], camera: Camera) -> dict[str, Any] | Non
     }
 
 
-def _vector(values: Float[np.ndarray, "3"]) -> dict[str, float]:
+def _vector(values: _Point) -> dict[str, float]:
     return dict(zip("xyz", map(float, values), strict=True))
 
 
-def _quaternion(orientation_wxyz: Float[np.ndarray, "4"]) -> dict[str, float]:
+def _quaternion(orientation_wxyz: _Turn) -> dict[str, float]:
     wxyz = orientation_wxyz if np.isfinite(orientation_wxyz).all() else (1.0, 0.0, 0.0, 0.0)
     return dict(zip("wxyz", map(float, wxyz), strict=True))
 
