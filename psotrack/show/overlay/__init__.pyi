@@ -1,8 +1,7 @@
 from .drawing import DrawnTracks, ImagePlaces, draw_drones, drawn_tracks, places_in
-from .folder import Codec, OverlayOptions, WrittenOverlays, find_codec, save_picture, write_overlays
+from .folder import OverlayOptions, WrittenOverlays, find_codec, save_picture, write_overlays
 
 __all__ = [
-    "Codec",
     "DrawnTracks",
     "ImagePlaces",
     "OverlayOptions",

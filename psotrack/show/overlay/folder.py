@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -181,21 +181,9 @@ _VIDEO_WIDTH_PX, _PICTURE_WIDTH_PX = 1920, 1440
 _TRIED_WH = (320, 240)
 
 
-@dataclass(frozen=True)
-class Codec:
-    """A codec of MP4 files.
-
-    Attributes:
-        name: name for people.
-        fourcc: the four characters by which OpenCV knows the codec.
-    """
-
-    name: str
-    fourcc: str
-
-
-#: Codecs from the best one on. Browsers and phones play H.264; OpenCV's wheels encode it on few machines.
-_CODECS = (Codec("H.264", "avc1"), Codec("MPEG-4", "mp4v"))
+#: Codecs of MP4 files from the best one on: how OpenCV knows them, and their names for people. Browsers and phones play
+#: H.264; OpenCV's wheels encode it on few machines.
+_CODECS = {"avc1": "H.264", "mp4v": "MPEG-4"}
 
 
 @dataclass(frozen=True)
@@ -219,19 +207,19 @@ class WrittenOverlays:
 
     Attributes:
         folder: folder of the videos.
-        codec: codec of the videos.
+        codec: name of the codec of the videos.
         written: videos that were made.
         kept: videos that were there already.
     """
 
     folder: Path
-    codec: Codec
+    codec: str
     written: tuple[Path, ...]
     kept: tuple[Path, ...]
 
     def __str__(self) -> str:
         kept = f", {len(self.kept)} were there already" if self.kept else ""
-        return f"{self.folder}: {len(self.written)} videos in {self.codec.name}{kept}"
+        return f"{self.folder}: {len(self.written)} videos in {self.codec}{kept}"
 
 
 def write_overlays(
@@ -273,7 +261,7 @@ def write_overlays(
         with report("overlay", sum(len(video.time_s) for _, video in tasks)) as advance:
             map_in_processes(write_video, tasks, jobs=jobs or os.cpu_count() or 1, advance=advance)
     written = tuple(path for path, _ in tasks)
-    return WrittenOverlays(folder, codec, written, tuple(folder / name for name in kept))
+    return WrittenOverlays(folder, _CODECS[codec], written, tuple(folder / name for name in kept))
 
 
 def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 5, force: bool = False) -> None:
@@ -291,7 +279,7 @@ def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 5, fo
     """
     refuse_to_overwrite(path, force)
     recording, cameras = _filmed(flight)
-    video = _Scene(flight, recording).mosaic(cameras[:most_cameras], _CODECS[0], _PICTURE_WIDTH_PX)
+    video = _Scene(flight, recording).mosaic(cameras[:most_cameras], "", _PICTURE_WIDTH_PX)
     instant = len(video.time_s) // 2
     numbers = video.frame[instant].tolist()
     frames = [
@@ -303,7 +291,7 @@ def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 5, fo
         temporary.write_bytes(coded.tobytes())
 
 
-def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
+def find_codec(codecs: Collection[str] = _CODECS) -> str:
     """The first of some codecs with which a video can be written and read back.
 
     Raises:
@@ -311,13 +299,13 @@ def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
     """
     for codec in codecs:
         with tempfile.TemporaryDirectory(prefix="psotrack-") as folder, contextlib.suppress(OutputError):
-            with encoded_video(Path(folder) / "tried.mp4", codec.fourcc, 25.0, _TRIED_WH) as encoder:
+            with encoded_video(Path(folder) / "tried.mp4", codec, 25.0, _TRIED_WH) as encoder:
                 for level in (0, 255):
                     encoder.write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
             return codec
     raise OutputError(
         "overlay",
-        expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}",
+        expected=f"one of the codecs {', '.join(codecs)}",
         found="none",
         remedy=f"is the disk of {tempfile.gettempdir()} full? videos were tried there",
     )
@@ -394,16 +382,16 @@ class _Scene:
             view_in_images(recording, each.trajectories, each.size_m) for each in flight.tracks
         ]
 
-    def of_camera(self, name: str, codec: Codec, scale: float) -> DrawnVideo:
+    def of_camera(self, name: str, codec: str, scale: float) -> DrawnVideo:
         """The video of one camera, at the times of its frames."""
         video = self._recording.videos[name]
         size_wh = _even(np.array(video.image_size_wh) * scale)
         time_s = self._recording.exposed[name].time_s[: video.num_frames]
         camera, frame = self._camera(name, size_wh), np.arange(len(time_s))[:, None]
         shown = self._tracks, frame, self._rows_at(time_s), time_s
-        return DrawnVideo(codec.fourcc, video.fps, size_wh, (camera,), *shown)
+        return DrawnVideo(codec, video.fps, size_wh, (camera,), *shown)
 
-    def mosaic(self, names: Sequence[str], codec: Codec, width_px: int) -> DrawnVideo:
+    def mosaic(self, names: Sequence[str], codec: str, width_px: int) -> DrawnVideo:
         """The video of some cameras at the recording's instants, with the map; images keep their aspect ratios."""
         columns = int(np.ceil(np.sqrt(len(names) + 1)))
         width, height = self._recording.videos[names[0]].image_size_wh
@@ -414,7 +402,7 @@ class _Scene:
             own_wh = np.array(self._recording.videos[name].image_size_wh)
             cameras.append(self._camera(name, _even(own_wh * (np.array(tile_wh) / own_wh).min())))
         return DrawnVideo(
-            codec.fourcc,
+            codec,
             timeline.rate_hz,
             tile_wh,
             tuple(cameras),

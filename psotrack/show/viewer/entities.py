@@ -103,36 +103,20 @@ class EntityLog:
             found = found if counts is None else found.partition(np.diff(own))
             rr.send_columns(path, times, found, recording=self._stream, strict=True)
 
-    def boxes(
-        self,
-        path: str,
-        at: Instants,
-        counts: _Counts,
-        boxes_px: Float[np.ndarray, "boxes 4"],
-        rgb: Any,
-        labels: list[str] | None = None,
+    def marks(
+        self, path: str, at: Instants, kind: Any, counts: _Counts, rgb: Any, radius_px: float, **values: Any
     ) -> None:
-        """Log boxes in images over time, in one colour or in a colour each; without names, they have thin lines."""
-        radius = -0.75 if labels is None else -1.5  # negative: in pixels of the screen
-        self.static(path, rr.Boxes2D.from_fields(radii=[radius], show_labels=labels is not None))
-        centre_px, half_px = (boxes_px[:, 2:] + boxes_px[:, :2]) / 2, (boxes_px[:, 2:] - boxes_px[:, :2]) / 2
-        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(boxes_px), 3))
-        sides = {"centers": centre_px, "half_sizes": half_px}
-        self.rows(path, at, rr.Boxes2D, counts, **sides, colors=colours, labels=labels)
+        """Log marks in images over time, in one colour or in a colour each; see `rows`.
 
-    def lines(
-        self,
-        path: str,
-        at: Instants,
-        counts: _Counts,
-        lines_px: Float[np.ndarray, "lines points 2"],
-        rgb: Any,
-        labels: list[str] | None = None,
-    ) -> None:
-        """Log lines in images over time, in one colour or in a colour each."""
-        self.static(path, rr.LineStrips2D.from_fields(radii=[-1.0], show_labels=labels is not None))
-        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(lines_px), 3))
-        self.rows(path, at, rr.LineStrips2D, counts, strips=list(lines_px), colors=colours, labels=labels)
+        Args:
+            path, at, kind, counts, **values: as for `rows`.
+            rgb: the colour, or a colour of each mark.
+            radius_px: half the width of the lines, pixels of the screen.
+        """
+        has_labels = values.get("labels") is not None
+        self.static(path, kind.from_fields(radii=[-radius_px], show_labels=has_labels))
+        colours = np.broadcast_to(np.array(rgb, np.uint8), (int(counts.sum()), 3))
+        self.rows(path, at, kind, counts, colors=colours, **values)
 
 
 def part(name: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -96,7 +97,8 @@ def log_images(
         labels = [f"{marker}" for image in shown for marker in image.marker_ids.tolist()]
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
         outlines_px = corners_px[:, [0, 1, 2, 3, 0]] + 0.5
-        log.lines(f"{path}/markers", at, counts, outlines_px, MARKER_RGB, labels)
+        strips = {"strips": list(outlines_px), "labels": labels}
+        log.marks(f"{path}/markers", at, rr.LineStrips2D, counts, MARKER_RGB, 1.0, **strips)
 
 
 def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, tuple[int, float]]:
@@ -129,11 +131,18 @@ def _log_encoded(
 
 
 def _log_boxes(
-    log: EntityLog, path: str, at: Instants, boxes_px: Sequence[np.ndarray], rgb: tuple[int, int, int]
+    log: EntityLog,
+    path: str,
+    at: Instants,
+    boxes_px: Sequence[np.ndarray],
+    rgb: Any,
+    labels: list[str] | None = None,
 ) -> None:
-    """Log the boxes of each row, without names."""
+    """Log the boxes of each row; those without names have thin lines."""
     counts = np.array([len(each) for each in boxes_px], int)
-    log.boxes(path, at, counts, np.concatenate([np.zeros((0, 4)), *boxes_px]), rgb)
+    low_px, high_px = np.split(np.concatenate([np.zeros((0, 4)), *boxes_px]), 2, axis=1)
+    boxes = {"centers": (high_px + low_px) / 2, "half_sizes": (high_px - low_px) / 2, "labels": labels}
+    log.marks(path, at, rr.Boxes2D, counts, rgb, 0.75 if labels is None else 1.5, **boxes)
 
 
 def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
@@ -161,7 +170,8 @@ def _log_tracks(log: EntityLog, recording: Recording, tracks: FlightTracks, step
         there = np.isfinite(boxes_px).all(axis=-1)
         labels = [tracks.names[drone] for drone in np.nonzero(there)[1]]
         own = tracks_path(f"{path}/boxes", tracks)
-        log.boxes(own, at, there.sum(axis=1), boxes_px[there], rgb[rows][there], labels)
+        shown_px = [each_px[shown] for each_px, shown in zip(boxes_px, there, strict=True)]
+        _log_boxes(log, own, at, shown_px, rgb[rows][there], labels)
         if tracks.trajectories.covariance_m2 is None:
             continue
         middle_px, shape_px2 = views.middle_px[rows, :, index], views.shape_px2[rows, :, index]
@@ -169,7 +179,8 @@ def _log_tracks(log: EntityLog, recording: Recording, tracks: FlightTracks, step
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
         outlines_px = ellipse_outlines_px(middle_px[there] + 0.5, shape_px2[there])
         own = tracks_path(f"{path}/ellipses", tracks)
-        log.lines(own, at, there.sum(axis=1), outlines_px, rgb[rows][there])
+        counts, own_rgb = there.sum(axis=1), rgb[rows][there]
+        log.marks(own, at, rr.LineStrips2D, counts, own_rgb, 1.0, strips=list(outlines_px))
 
 
 def _rows_shown(frame: Int[np.ndarray, " instants"], step: int) -> Int[np.ndarray, " rows"]:
