@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import SilhouetteSettings
-from psotrack.support import NotNegative, Positive, Share, bind, check_types, nearest, plain
+from psotrack.support import NotNegative, Positive, Share, bind, check_types, did_you_mean, plain
 
 SwarmKind = Literal["joint", "per-drone"]
 Clocks = Literal["given", "auto"]
@@ -367,8 +367,7 @@ def full_name(name: str) -> str:
 
 
 def _unknown(name: str) -> SettingsError:
-    near = nearest(name, setting_names())
-    remedy = f"did you mean {near}?" if near else ""
+    remedy = did_you_mean(name, setting_names())
     return SettingsError(name, expected="the name of a setting", found=name, remedy=remedy)
 
 

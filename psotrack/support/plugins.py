@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from psotrack.errors import SettingsError
-from psotrack.support.schema import nearest
+from psotrack.support.schema import did_you_mean
 
 PluginKind = Literal["search", "score", "method", "background", "detector"]
 
@@ -165,11 +165,10 @@ def _load(kind: PluginKind, name: str, setting: str, built_in: Sequence[str]) ->
             raise SettingsError(f"{setting} {name}", expected=expected, found=found)
         return make
     installed = plugin_names(kind)
-    near = nearest(name, [*built_in, *installed])
     none = "" if installed else f"no installed package adds more (entry points {GROUPS[kind]})"
     raise SettingsError(
         setting,
         expected=f"one of {', '.join([*built_in, *installed])}",
         found=name,
-        remedy=f"did you mean {near}?" if near else none,
+        remedy=did_you_mean(name, [*built_in, *installed]) or none,
     )

@@ -211,8 +211,8 @@ def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> Non
     container[last] = value
 
 
-def nearest(name: str, names: Iterable[str]) -> str:
-    """The name in `names` that was probably meant, or "" if there is none.
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """The question after the name in `names` that was probably meant, for messages; "" if there is none.
 
     That is the name with the same letters, or else the most similar one of about this length, compared as a whole or by
     its last part where names have dots; or the only one that begins with `name`.
@@ -225,9 +225,9 @@ def nearest(name: str, names: Iterable[str]) -> str:
         near = [other for other in others if abs(len(other) - len(word)) <= -(-len(word) // 4)]
         swapped = [other for other in near if sorted(other) == sorted(word)]
         if close := swapped or difflib.get_close_matches(word, near, 1, _SIMILAR):
-            return others[close[0]]
+            return f"did you mean {others[close[0]]}?"
     begun = [other for part, other in last_parts.items() if len(last) > 2 and part.startswith(last)]
-    return begun[0] if len(begun) == 1 else ""
+    return f"did you mean {begun[0]}?" if len(begun) == 1 else ""
 
 
 def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str, Any]) -> BoundArguments:
@@ -242,12 +242,11 @@ def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str,
         variable = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
         parameters = [key for key, each in signature.parameters.items() if each.kind not in variable]
         unknown = next((each for each in kwargs if each not in parameters), None)
-        near = nearest(unknown, parameters) if unknown else ""
         raise SettingsError(
             name,
             expected=f"the arguments {', '.join(parameters)}" if parameters else "no arguments",
             found=f"{unknown}" if unknown else f"{error}",
-            remedy=f"did you mean {near}?" if near else "",
+            remedy=did_you_mean(unknown, parameters) if unknown else "",
         ) from None
 
 
@@ -313,8 +312,7 @@ def _translate(message: str, data: Any, kind: type) -> tuple[str, str, str, str]
 
 def _suggestion(names: list[str], found: str) -> tuple[str, str, str]:
     """Expected, found and remedy for a name that is not in `names`."""
-    near = nearest(found, names)
-    return f"one of {', '.join(names)}", _on_one_line(found), f"did you mean {near}?" if near else ""
+    return f"one of {', '.join(names)}", _on_one_line(found), did_you_mean(found, names)
 
 
 def _on_one_line(name: str) -> str:

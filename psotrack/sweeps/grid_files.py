@@ -18,7 +18,7 @@ import msgspec
 from psotrack.errors import SettingsError, errors_name
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings, flatten, setting_names
-from psotrack.support import assign, convert, nearest, read_toml
+from psotrack.support import assign, convert, did_you_mean, read_toml
 from psotrack.sweeps.cells import Cell, Perturbation, cameras_label
 
 #: Dotted names that the tables [settings] and [methods.NAME] may contain.
@@ -247,7 +247,6 @@ def _check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
         return
     if any(other.startswith(f"{name}.") for other in names):
         raise SettingsError(f"{prefix}{name}", expected="a table with names", found="none")
-    near = nearest(name, names)
     if name == "seed":
         remedy = "every run has a seed of its own: set runs = 10, and first_seed if the first seed is not 0"
     elif name in INPUTS:
@@ -255,7 +254,7 @@ def _check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
     elif name in SETTINGS:
         remedy = "it belongs in [settings], or in [grid] with a list of values"
     else:
-        remedy = f"did you mean {near}?" if near else f"allowed names are {', '.join(names)}"
+        remedy = did_you_mean(name, names) or f"allowed names are {', '.join(names)}"
     raise SettingsError(f"{prefix}{name}", expected="an allowed name", found=name, remedy=remedy)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import SettingsError
-from psotrack.support import nearest
+from psotrack.support import did_you_mean
 
 logger = logging.getLogger(__name__)
 
@@ -98,9 +98,8 @@ def render_table(table: pd.DataFrame, format: str = "text", *, decimals: int | N
         SettingsError: there is no such format.
     """
     if format not in FORMATS:
-        near = nearest(format, FORMATS)
-        remedy = f"did you mean {near}?" if near else ""
-        raise SettingsError("format", expected=f"one of {', '.join(FORMATS)}", found=format, remedy=remedy)
+        expected, remedy = f"one of {', '.join(FORMATS)}", did_you_mean(format, FORMATS)
+        raise SettingsError("format", expected=expected, found=format, remedy=remedy)
     if format == "csv":
         return _csv(table)
     writer = {"text": _text, "markdown": _markdown, "latex": _latex}[format]
@@ -133,14 +132,9 @@ def _find_column(where: str, name: str, names: list[str]) -> str:
     ends = [name] if name in names else [other for other in names if other.endswith(f".{name}")]
     if len(ends) == 1:
         return ends[0]
-    near = nearest(name, names)
-    begin = [other for other in names if name and other.rpartition(".")[2].startswith(name)]
-    if ends:
-        remedy = f"it may be {' or '.join(ends)}"
-    elif near:
-        remedy = f"did you mean {near}?"
-    else:
-        remedy = f"it may be {' or '.join(begin)}" if begin else f"there are {', '.join(names)}"
+    may_be = ends or [other for other in names if name and other.rpartition(".")[2].startswith(name)]
+    remedy = "" if ends else did_you_mean(name, names)
+    remedy = remedy or (f"it may be {' or '.join(may_be)}" if may_be else f"there are {', '.join(names)}")
     raise SettingsError(where, expected="the name of one column", found=name, remedy=remedy)
 
 

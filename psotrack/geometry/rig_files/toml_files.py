@@ -34,7 +34,7 @@ from typing import Any
 from psotrack.errors import InputError
 from psotrack.geometry import Rig
 from psotrack.geometry.rig_files.fields import CameraFields, camera_values, stated_unit_m
-from psotrack.support import nearest, read_toml, write_toml
+from psotrack.support import did_you_mean, read_toml, write_toml
 
 #: Newest version of the layout.
 VERSION = 1
@@ -59,9 +59,8 @@ def fields_of_table(path: Path, name: str, table: Mapping[str, Any]) -> CameraFi
     """
     fields = CameraFields(path, f"cameras.{name}", table, name, unit_m=1.0)
     for key in table:
-        near = "" if key in KEYS else nearest(key, KEYS)
-        if near:
-            raise fields.error(key, f"one of {', '.join(KEYS)}", key, f"did you mean {near}?")
+        if key not in KEYS and (meant := did_you_mean(key, KEYS)):
+            raise fields.error(key, f"one of {', '.join(KEYS)}", key, meant)
     model = table.get("model", "opencv")
     if model not in _MODELS:
         raise fields.error("model", " or ".join(_MODELS), str(model))

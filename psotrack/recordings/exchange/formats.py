@@ -319,21 +319,17 @@ def _check_name(out: Path, to: str, num_seen: int, footage: Footage | None) -> N
     form = FORMATS[to]
     is_file = out.suffix in form.suffixes
     is_folder = not any(out.suffix.lower() in each.suffixes for each in FORMATS.values())
-    expected = " or ".join(form.suffixes)
-    remedy = ""
-    if to == "mot" and footage is not None:
+    file, remedy = f"a file that ends in {' or '.join(form.suffixes)}", ""
+    expected = ", or ".join([*(["a folder"] if form.entries else []), *([file] if form.suffixes else [])])
+    fits = is_file or (is_folder and bool(form.entries))
+    if to == "mot":
         expected, fits = "a folder, for positions and boxes", is_folder
-    elif to == "mot":
-        expected, fits = f"a file that ends in {expected}, for positions alone", is_file
-        remedy = "name SEQ for a folder with boxes per camera"
-    elif not form.entries:
-        expected, fits = f"a file that ends in {expected}", is_file
-    else:
-        file = f", or a file that ends in {expected}" if form.suffixes else ""
-        expected, fits = f"a folder{file}", is_folder or is_file
-        if is_file and form.is_of_one and num_seen > 1:
-            expected = f"a folder, because a {to.upper()} file holds one drone and the tracks have {num_seen}"
-            fits = False
+        if footage is None:
+            expected, fits = f"{file}, for positions alone", is_file
+            remedy = "name SEQ for a folder with boxes per camera"
+    elif is_file and form.is_of_one and num_seen > 1:
+        expected = f"a folder, because a {to.upper()} file holds one drone and the tracks have {num_seen}"
+        fits = False
     if not fits:
         raise SettingsError("--out", expected=expected, found=out.name, remedy=remedy)
 

@@ -209,28 +209,22 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
             found=f"{trajectories.time_s.min():g} s",
         )
     names = _ros_names(trajectories.drones, "drone")
-    frames = {} if footage is None else camera_frames(footage.recording, trajectories)
-    camera_names = _ros_names(list(frames), "cam")
-    _check_different([WORLD, *names, *camera_names])
-    lenses, filmed = dict[str, Camera](), dict[str, str]()
+    times = {} if footage is None else camera_frames(footage.recording, trajectories)
+    of_ros = dict(zip(times, _ros_names(list(times), "cam"), strict=True))
+    _check_different([WORLD, *names, *of_ros.values()])
+    lenses, videos = dict[str, Camera](), dict[str, VideoInfo]()
     if footage is not None:
-        rig = footage.recording.rig
-        lenses = {
-            name: rig.cameras[rig.names.index(own)] for name, own in zip(camera_names, frames, strict=True)
-        }
-        shown = footage.recording.videos if footage.images else {}
-        filmed = {name: own for name, own in zip(camera_names, frames, strict=True) if own in shown}
-    total = trajectories.num_frames + sum(frames[own].num_frames for own in filmed.values())
+        filmed = [each for each in footage.recording.placed if each.name in times]
+        lenses = {each.name: each.camera for each in filmed if each.camera is not None}
+        videos = {each.name: each.video for each in filmed if footage.images and each.video is not None}
+    total = trajectories.num_frames + sum(times[own].num_frames for own in videos)
     with report("messages", total) as advance, path.open("wb") as stream:
         streams = [_drone_messages(trajectories, names, advance)]
         if footage is not None:
-            places = _camera_messages(lenses, float(trajectories.time_s[-1]))
-            videos = footage.recording.videos
-            images = [
-                _image_messages(name, lenses[name], videos[own], frames[own], advance)
-                for name, own in filmed.items()
-            ]
-            streams = [places, *streams, *images]
+            named = {of_ros[own]: lens for own, lens in lenses.items()}
+            streams.insert(0, _camera_messages(named, float(trajectories.time_s[-1])))
+        for own, video in videos.items():
+            streams.append(_image_messages(of_ros[own], lenses[own], video, times[own], advance))
         writer = writer_class(stream)
         schemas = {name: writer.register_msgdef(name, text) for name, text in DEFINITIONS.items()}
         drones = dict(zip((f"/{name}/pose" for name in names), trajectories.drones, strict=True))
@@ -238,9 +232,7 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
         for time_ns, topic, kind, content in heapq.merge(*streams, key=lambda message: message[0]):
             writer.write_message(topic, schemas[kind], content, time_ns, time_ns)
         writer.finish()
-    lost = [
-        own for own, lens in zip(frames, lenses.values(), strict=True) if camera_message({}, lens) is None
-    ]
+    lost = [own for own, lens in lenses.items() if camera_message({}, lens) is None]
     return [f"the lens of {own}, for which ROS has no model" for own in lost]
 
 
