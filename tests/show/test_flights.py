@@ -109,14 +109,14 @@ def test_nine_of_ten_normal_points_are_inside_the_ellipsoid(seed):
     rng = np.random.default_rng(seed)
     factor = rng.normal(size=(3, 3))
     covariance_m2 = np.stack([factor @ factor.T, np.full((3, 3), np.nan)])
-    found = ellipsoids_90(covariance_m2)
+    half_axes_m, rotation = ellipsoids_90(covariance_m2)
     points_m = rng.multivariate_normal(np.zeros(3), covariance_m2[0], 4000)
-    own = points_m @ found.rotation[0] / found.half_axes_m[0]
+    own = points_m @ rotation[0] / half_axes_m[0]
     inside = np.mean(np.linalg.norm(own, axis=1) <= 1)
     # The standard deviation of the share is sqrt(0.9 * 0.1 / 4000) = 0.0047; six of it.
     assert abs(inside - 0.9) < 0.029
-    np.testing.assert_allclose(np.linalg.det(found.rotation), 1.0, rtol=1e-9)
-    assert np.isnan(found.half_axes_m[1]).all(), "unknown covariances have unknown ellipsoids"
+    np.testing.assert_allclose(np.linalg.det(rotation), 1.0, rtol=1e-9)
+    assert np.isnan(half_axes_m[1]).all(), "unknown covariances have unknown ellipsoids"
 
 
 def test_events_of_the_status():

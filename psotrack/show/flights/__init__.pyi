@@ -11,7 +11,6 @@ from .events import (
 )
 from .flight import (
     USUAL_SIZE_M,
-    Ellipsoids,
     FlightTracks,
     TrackedFlight,
     colour_rgb,
@@ -41,7 +40,6 @@ from .run_record import (
 __all__ = [
     "QUANTITIES",
     "USUAL_SIZE_M",
-    "Ellipsoids",
     "Event",
     "EventKind",
     "FlightTracks",

@@ -83,6 +83,7 @@ def _event(
     position_m: Float[np.ndarray, "3"] = _NOWHERE_M,
 ) -> Event:
     trajectories = tracks.trajectories
+    row = min(row, trajectories.num_frames - 1)
     at = float(trajectories.time_s[row]), int(trajectories.frame[row])
     return Event(*at, kind, drones, text, tracks.label, np.asarray(position_m, np.float64))
 
@@ -122,11 +123,11 @@ def _of_record(tracks: FlightTracks, recording: Recording | None) -> Iterator[Ev
         between_m = trajectories.position_m[row, together].mean(axis=0) if together else _NOWHERE_M
         yield _event(tracks, row, EventKind.MET, names, text, between_m)
     for knock in tracks.record.knocks:
-        row = min(int(np.searchsorted(trajectories.frame, knock["frame"])), trajectories.num_frames - 1)
+        row = int(np.searchsorted(trajectories.frame, knock["frame"]))
         yield _event(tracks, row, EventKind.LEFT_OUT, (), f"camera {knock['camera']} was knocked")
     for camera, left_out in tracks.record.left_out.items():
         for first, stop in left_out:
-            row = min(_row_of_frame(tracks, recording, camera, first), trajectories.num_frames - 1)
+            row = _row_of_frame(tracks, recording, camera, first)
             text = f"camera {camera} is left out in {stop - first} frames: foreground is everywhere"
             yield _event(tracks, row, EventKind.LEFT_OUT, (), text)
 
@@ -148,7 +149,7 @@ def _of_errors(flight: TrackedFlight, tracks: FlightTracks) -> Iterator[Event]:
     def happened(kind: EventKind, at: int, text: str) -> Event:
         """An event in a row of the errors."""
         name, frame = f"{errors['drone'].iloc[at]}", int(errors["frame"].iloc[at])
-        row = min(int(np.searchsorted(tracks.trajectories.frame, frame)), tracks.trajectories.num_frames - 1)
+        row = int(np.searchsorted(tracks.trajectories.frame, frame))
         place_m = truth.position_m[np.searchsorted(truth.frame, frame), truth.drones.index(name)]
         return _event(tracks, row, kind, (name,), f"{name} {text}", place_m)
 

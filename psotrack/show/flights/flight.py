@@ -15,7 +15,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.evaluation import INSIDE_90, errors_over_time
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.pipeline import TrackedRecording
-from psotrack.recordings import Recording, VideoInfo
+from psotrack.recordings import Recording
 from psotrack.recordings.datasets import is_recording, open_recording
 from psotrack.recordings.exchange import read_tracks
 from psotrack.show.flights.run_record import RunRecord, as_run_record, read_run_record
@@ -68,24 +68,17 @@ def status_rgb(
     return table[status, np.arange(len(colours))]
 
 
-@dataclass(frozen=True)
-class Ellipsoids:
-    """Ellipsoids about points.
-
-    Attributes:
-        half_axes_m: (..., 3), half lengths of the axes, from the shortest to the longest, metres; NaN if unknown.
-        rotation: (..., 3, 3), rotation matrices whose columns are the directions of the axes in the world.
-    """
-
-    half_axes_m: Float[np.ndarray, "*points 3"]
-    rotation: Float[np.ndarray, "*points 3 3"]
-
-
-def ellipsoids_90(covariance_m2: Float[np.ndarray, "*points 3 3"]) -> Ellipsoids:
+def ellipsoids_90(
+    covariance_m2: Float[np.ndarray, "*points 3 3"],
+) -> tuple[Float[np.ndarray, "*points 3"], Float[np.ndarray, "*points 3 3"]]:
     """The ellipsoid that holds 90 % of each normal distribution.
 
     Args:
         covariance_m2: (..., 3, 3), covariances, m²; NaN where unknown.
+
+    Returns:
+        (..., 3), half lengths of the axes, from the shortest to the longest, metres, NaN where unknown; and
+        (..., 3, 3), rotation matrices whose columns are the directions of the axes in the world.
     """
     known = np.isfinite(covariance_m2).all(axis=(-2, -1))
     whole = np.where(known[..., None, None], covariance_m2, np.eye(3)).astype(np.float64)
@@ -93,13 +86,15 @@ def ellipsoids_90(covariance_m2: Float[np.ndarray, "*points 3 3"]) -> Ellipsoids
     # Eigenvectors may form a left-handed system, which is no rotation.
     directions[..., :, 0] *= np.linalg.det(directions)[..., None]
     half_m = np.sqrt(np.maximum(variance_m2, 0.0) * INSIDE_90)
-    return Ellipsoids(np.where(known[..., None], half_m, np.nan), directions)
+    return np.where(known[..., None], half_m, np.nan), directions
 
 
 _logger = logging.getLogger(__name__)
 
 #: Full lengths of a drone of whose size the record says nothing, metres: an assumption, for drawing only.
 USUAL_SIZE_M = (0.3, 0.3, 0.3)
+#: Name of tracks that are of no file.
+_IN_MEMORY = "tracks"
 #: Largest distance of a row from a time that it is shown at, in intervals between rows.
 _NEAR = 0.6
 
@@ -225,21 +220,18 @@ def split_sequence(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None
     return tuple(paths), None
 
 
-def flight_of(
-    tracks: TrackedRecording | Trajectories, recording: Recording | None = None, *, label: str = "tracks"
-) -> TrackedFlight:
+def flight_of(tracks: TrackedRecording | Trajectories, recording: Recording | None = None) -> TrackedFlight:
     """The flight of tracks that are in memory.
 
     Args:
         tracks: the result of `track`, or trajectories.
         recording: the recording; None shows the tracks alone.
-        label: name of the tracks.
     """
     if isinstance(tracks, TrackedRecording):
-        record = as_run_record(dict(tracks.record), label)
-        own = _flight_tracks(label, Path(label), tracks.trajectories, record)
+        record = as_run_record(dict(tracks.record), _IN_MEMORY)
+        own = _flight_tracks(_IN_MEMORY, Path(_IN_MEMORY), tracks.trajectories, record)
     else:
-        own = _flight_tracks(label, Path(label), tracks, None)
+        own = _flight_tracks(_IN_MEMORY, Path(_IN_MEMORY), tracks, None)
     return TrackedFlight(_name_of(own) if recording is None else recording.name, (own,), recording)
 
 
@@ -286,10 +278,10 @@ def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
         return replace(flight, tracks=tuple(tracks))
     recording = flight.recording.usable(num_frames=num_frames, videos=False)
     end_s = float(recording.timeline().time_s[-1]) + 0.5 / recording.fps
-    onboard = {
-        name: replace(camera, video=_video_until(camera.video, end_s))
-        for name, camera in recording.onboard.items()
-    }
+    onboard = {}
+    for name, camera in recording.onboard.items():
+        count = max(1, min(camera.video.num_frames, int(end_s * camera.video.fps) + 1))
+        onboard[name] = replace(camera, video=replace(camera.video, num_frames=count))
     reference = recording.reference
     if reference is not None:
         reference = replace(reference, truth=_cut(reference.truth, end_s))
@@ -309,10 +301,6 @@ def _until(tracks: FlightTracks, end_s: float) -> FlightTracks:
 
 def _cut(trajectories: Trajectories, end_s: float) -> Trajectories:
     return trajectories.at_frames(trajectories.frame[trajectories.time_s <= end_s])
-
-
-def _video_until(video: VideoInfo, end_s: float) -> VideoInfo:
-    return replace(video, num_frames=max(1, min(video.num_frames, int(end_s * video.fps) + 1)))
 
 
 def read_tracks_file(path: Path | str, label: str, recording: Recording | None = None) -> FlightTracks:

@@ -49,15 +49,6 @@ def _packed_library() -> str:
     return base64.b64encode(gzip.compress(_asset("three.bundle.js").encode(), mtime=0)).decode("ascii")
 
 
-def scene_frame(scene: dict[str, Any]) -> str:
-    """A 3D view as an HTML element of its own, for a notebook's cell; see `render`."""
-    content = render("scene.html", scene, title="3D view")
-    return (
-        f'<iframe title="3D view" srcdoc="{html.escape(content)}" '
-        f'style="width: 100%; height: {_CELL_HEIGHT_PX}px; border: 0"></iframe>'
-    )
-
-
 def render(template: str, scene: dict[str, Any], **values: Any) -> str:
     """The text of a page.
 
@@ -139,7 +130,11 @@ class View3D:
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
-        return scene_frame(scene_data(self.flight))
+        content = render("scene.html", scene_data(self.flight), title="3D view")
+        return (
+            f'<iframe title="3D view" srcdoc="{html.escape(content)}" '
+            f'style="width: 100%; height: {_CELL_HEIGHT_PX}px; border: 0"></iframe>'
+        )
 
 
 def view_3d(tracks: TrackedRecording | Trajectories, recording: Recording | None = None) -> View3D:
@@ -214,10 +209,9 @@ def _drones(tracks: FlightTracks, time_s: _Rows, origin_m: _Point) -> list[dict[
         "status": np.nan_to_num(_at_times(flown, time_s, status), nan=float(Status.LOST)),
     }
     if flown.covariance_m2 is not None:
-        ellipsoids = ellipsoids_90(_at_times(flown, time_s, flown.covariance_m2))
-        of_rows["half_axes_m"] = ellipsoids.half_axes_m
-        turns = Rotation.from_matrix(ellipsoids.rotation.reshape(-1, 3, 3)).as_quat()
-        of_rows["rotation_xyzw"] = turns.reshape(*ellipsoids.rotation.shape[:2], 4)
+        of_rows["half_axes_m"], turn = ellipsoids_90(_at_times(flown, time_s, flown.covariance_m2))
+        turns = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_quat()
+        of_rows["rotation_xyzw"] = turns.reshape(*turn.shape[:2], 4)
     return [
         {
             "name": name,

@@ -6,7 +6,6 @@ JPEG. Images are made one after the other, so that an hour does not fill the mem
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int, UInt8, UInt32
+from jaxtyping import Float, Int, UInt8
 
 from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import (
@@ -197,19 +196,11 @@ def _read_coverages(silhouettes: Any, frames: range) -> Iterator[_Coverage]:
 
 
 def _silhouette_png(coverage: _Coverage) -> bytes:
-    """An image that is as opaque as a cell is covered."""
-    # Pixels of four bytes as one number each, which NumPy looks up quickly.
-    bgra = _silhouette_colours()[coverage].view(np.uint8).reshape(*coverage.shape, 4)
+    """An image that is as opaque as a cell is covered, and without colour where nothing is."""
+    bgra = np.zeros((*coverage.shape, 4), np.uint8)
+    bgra[coverage > 0, :3] = _SILHOUETTE_BGR
+    bgra[..., 3] = coverage * _OPACITY
     return cv2.imencode(".png", bgra, _PNG)[1].tobytes()
-
-
-@functools.cache
-def _silhouette_colours() -> UInt32[np.ndarray, "256"]:
-    """Blue, green, red and opacity of each coverage; without colour where nothing is covered."""
-    table = np.zeros((256, 4), np.uint8)
-    table[1:, :3] = _SILHOUETTE_BGR
-    table[:, 3] = np.arange(256) * _OPACITY
-    return table.view(np.uint32).ravel()
 
 
 def _blob_boxes_px(coverage: _Coverage, cell_px: int) -> Float[np.ndarray, "blobs 4"]:

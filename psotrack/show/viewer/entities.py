@@ -220,14 +220,14 @@ def log_drones(log: EntityLog, path: str, tracks: FlightTracks, drones: Sequence
     log.rows(f"{path}/body", at, rr.Boxes3D, known.sum(axis=1), **shapes, labels=labels)
     if flown.covariance_m2 is None:
         return
-    ellipsoids = ellipsoids_90(flown.covariance_m2[:, drones])
+    half_m, turn = ellipsoids_90(flown.covariance_m2[:, drones])
     # The ellipsoid of a lost drone grows to the size of the room.
-    shown = known & np.isfinite(ellipsoids.half_axes_m).all(axis=-1) & (status != Status.LOST)
-    turned = Rotation.from_matrix(ellipsoids.rotation[shown]).as_quat()
+    shown = known & np.isfinite(half_m).all(axis=-1) & (status != Status.LOST)
+    turned = Rotation.from_matrix(turn[shown]).as_quat()
     # A large ellipsoid must not hide what is behind.
     fill = rr.components.FillMode.TransparentFillMajorWireframe
     log.static(f"{path}/ellipsoid", rr.Ellipsoids3D.from_fields(fill_mode=fill))
-    shapes = {"centers": position_m[shown], "half_sizes": ellipsoids.half_axes_m[shown], "colors": rgb[shown]}
+    shapes = {"centers": position_m[shown], "half_sizes": half_m[shown], "colors": rgb[shown]}
     log.rows(f"{path}/ellipsoid", at, rr.Ellipsoids3D, shown.sum(axis=1), **shapes, quaternions=turned)
 
 
