@@ -25,6 +25,7 @@ from psotrack.trajectories import Status, Trajectories
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+_Point = Float[np.ndarray, "3"]
 #: Fraction of the pale colour in the colours of predicted drones, and the grey of lost ones, 0 to 255.
 _COASTING_PALER, _LOST_GREY = 0.65, 150
 
@@ -150,6 +151,18 @@ class TrackedFlight:
     def truth(self) -> Trajectories | None:
         """The reference of the recording; None where there is none."""
         return None if self.recording is None else self.recording.truth
+
+    @property
+    def bounds_m(self) -> tuple[_Point, _Point] | None:
+        """Lowest and highest coordinates of tracks, reference and cameras, metres; None where nothing has a place."""
+        parts = [each.trajectories.position_m[each.trajectories.seen] for each in self.tracks]
+        if self.truth is not None:
+            parts.append(self.truth.position_m)
+        if self.recording is not None:
+            parts.append(np.asarray(self.recording.rig.cameras.centre_world))
+        points_m = np.concatenate([np.zeros((0, 3)), *(part.reshape(-1, 3) for part in parts)])
+        points_m = points_m[np.isfinite(points_m).all(axis=-1)]
+        return (points_m.min(axis=0), points_m.max(axis=0)) if len(points_m) else None
 
     def errors(self, tracks: FlightTracks) -> DataFrame | None:
         """Errors of tracks over time, see `errors_over_time`; None where there is nothing to compare.

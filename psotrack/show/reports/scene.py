@@ -184,17 +184,9 @@ def scene_data(flight: TrackedFlight) -> dict[str, Any]:
 
 def _bounds_m(flight: TrackedFlight) -> tuple[_Point, _Point]:
     """Lowest and highest coordinates of all that is shown, and of the floor, z = 0, if it is near."""
-    parts = [each.trajectories.position_m[each.trajectories.seen] for each in flight.tracks]
-    if flight.truth is not None:
-        parts.append(flight.truth.position_m.reshape(-1, 3))
-    if flight.recording is not None:
-        parts.append(np.asarray(flight.recording.rig.cameras.centre_world))
-    points_m = np.concatenate([np.zeros((0, 3)), *(np.asarray(part, np.float64) for part in parts)])
-    points_m = points_m[np.isfinite(points_m).all(axis=-1)]
-    points_m = points_m if len(points_m) else np.zeros((1, 3))
-    middle_m = (points_m.min(axis=0) + points_m.max(axis=0)) / 2
-    low_m = np.minimum(points_m.min(axis=0), middle_m - 0.05)
-    high_m = np.maximum(points_m.max(axis=0), middle_m + 0.05)
+    low_m, high_m = flight.bounds_m or (np.zeros(3), np.zeros(3))
+    middle_m = (low_m + high_m) / 2
+    low_m, high_m = np.minimum(low_m, middle_m - 0.05), np.maximum(high_m, middle_m + 0.05)
     if 0 < low_m[2] < (high_m - low_m).max():
         low_m[2] = 0.0
     return low_m, high_m

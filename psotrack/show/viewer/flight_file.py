@@ -107,14 +107,10 @@ def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
 
 def _eye(flight: TrackedFlight) -> rrb.EyeControls3D | None:
     """A look from a corner above, so that all cameras and drones are in view."""
-    parts = [each.trajectories.position_m.reshape(-1, 3) for each in flight.tracks]
-    if flight.recording is not None and len(flight.recording.rig):
-        parts.append(np.asarray(flight.recording.rig.cameras.centre_world, np.float64))
-    points_m = np.concatenate([np.zeros((0, 3)), *parts])
-    points_m = points_m[np.isfinite(points_m).all(axis=1)]
-    if not len(points_m):
+    bounds_m = flight.bounds_m
+    if bounds_m is None:
         return None
-    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    low, high = bounds_m
     reach_m = max(float(np.linalg.norm(high - low)), 1.0)
     target_m = low + (high - low) * [0.5, 0.5, 0.3]
     position_m = target_m + reach_m * np.array([-0.33, -0.52, 0.4])
