@@ -143,8 +143,8 @@ class Grid:
                 here, there = (" and ".join(names) for names in zip(*pairs, strict=True))
                 raise self._error(here, expected="cells that differ", found=f"the same cell as with {there}")
 
-    def _error(self, place: str, *, expected: str, found: str, remedy: str = "") -> SettingsError:
-        return SettingsError(f"{self.where}: {place}", expected=expected, found=found, remedy=remedy)
+    def _error(self, place: str, *, expected: str, found: str) -> SettingsError:
+        return SettingsError(f"{self.where}: {place}", expected=expected, found=found)
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True):

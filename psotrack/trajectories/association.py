@@ -77,13 +77,13 @@ def align(traj_est: Trajectories, traj_ref: Trajectories) -> AlignedPair:
     rows, columns = known.any(axis=1), known.any(axis=0)
     if not rows.any():
         raise InputError("reference", expected="a known position in at least one frame", found="none")
-    frame = traj_ref.frame[rows]
-    _, to, source = np.intersect1d(frame, traj_est.frame, assume_unique=True, return_indices=True)
+    frame, own = traj_ref.frame[rows], traj_est.frame
+    _, to, source = np.intersect1d(frame, own, assume_unique=True, return_indices=True)
     if not len(to):
         raise InputError(
             "estimate",
             expected=f"frames of the reference, which knows positions from frame {frame[0]} to {frame[-1]}",
-            found=_span(traj_est.frame),
+            found=f"frames {own[0]} to {own[-1]}" if len(own) else "no frames",
             remedy="check that both belong to the same sequence",
         )
     apart_s = np.abs(traj_est.time_s[source] - traj_ref.time_s[rows][to])
@@ -235,7 +235,3 @@ def _assign(
     rows, columns = linear_sum_assignment(np.where(possible, cost, forbidden))
     kept = possible[rows, columns]
     return rows[kept], columns[kept]
-
-
-def _span(frame: Int[np.ndarray, "frames"]) -> str:
-    return f"frames {frame[0]} to {frame[-1]}" if len(frame) else "no frames"

@@ -316,8 +316,9 @@ def from_rows(path: Path, rows: DroneRows, fps: float | None = None) -> Trajecto
         raise rows.error(row, expected="one row per frame and drone", found=found)
     shape = (len(frame), len(drones))
     quantities: dict[str, Any] = {}
+    known = {name for name, each in columns.items() if each.dtype == object or np.isfinite(each).any()}
     for name, parts in PARTS.items():
-        if name != "position_m" and not all(part in columns and _has_any(columns[part]) for part in parts):
+        if name != "position_m" and not known >= {*parts}:
             continue
         values = np.full((len(frame) * len(drones), len(parts)), Status.LOST if name == "status" else np.nan)
         words = [_STATUS[word] for word in columns["status"]] if name == "status" else None
@@ -329,11 +330,6 @@ def from_rows(path: Path, rows: DroneRows, fps: float | None = None) -> Trajecto
     return Trajectories(
         frame=frame, time_s=_times(rows, frame, frame_index, fps), drones=tuple(drones), **quantities
     )
-
-
-def _has_any(column: _Column) -> bool:
-    """Whether some value of a column is known."""
-    return column.dtype == object or bool(np.isfinite(column).any())
 
 
 def _check_values(rows: DroneRows) -> None:

@@ -262,7 +262,10 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
                 # `zipfile` would raise an OSError, which is taken for one of the folder's.
                 raise zipfile.BadZipFile("bytes at the beginning are missing")
             _check_names(path, [entry.filename for entry in entries])
-            _check_ratio(path, sum(entry.file_size for entry in entries))
+            size = sum(entry.file_size for entry in entries)
+            if size > (most := max(_SMALL, _MOST_RATIO * path.stat().st_size)):
+                expected = f"files of at most {most} bytes in an archive of {path.stat().st_size}"
+                raise InputError(path, expected=expected, found=f"{size} bytes", remedy="do not trust it")
             yield zipped
     # A zip file may be wrong in more ways than `zipfile` has exceptions for.
     except (
@@ -325,11 +328,3 @@ def _check_names(path: Path, names: list[str]) -> None:
         if name.casefold() in seen:
             raise InputError(path, expected="each file once", found=f"{name} twice")
         seen.add(name.casefold())
-
-
-def _check_ratio(path: Path, size: int) -> None:
-    """Raise `InputError` for an archive that unpacks to far more than it could have been made from."""
-    most = max(_SMALL, _MOST_RATIO * path.stat().st_size)
-    if size > most:
-        expected = f"files of at most {most} bytes in an archive of {path.stat().st_size}"
-        raise InputError(path, expected=expected, found=f"{size} bytes", remedy="do not trust it")

@@ -108,7 +108,8 @@ def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orien
             expected="equal numbers of positions and orientations, at least one",
             found=f"{len(position_m)} positions and {len(orientation_wxyz)} orientations",
         )
-    poses = np.hstack([position_m, _euler_rad(orientation_wxyz), orientation_wxyz])
+    euler_rad = Rotation.from_quat(orientation_wxyz, scalar_first=True).as_euler("xyz")
+    poses = np.hstack([position_m, euler_rad, orientation_wxyz])
     if not np.isfinite(poses[1:]).all():
         frame = int(np.argmin(np.isfinite(poses[1:]).all(axis=1))) + 1
         raise SettingsError("poses", expected="finite numbers", found=f"NaN or infinity at frame {frame}")
@@ -125,11 +126,6 @@ def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orien
 def pose_file(number: int, fps: float = 25.0) -> str:
     """Name of the pose file of drone `number`, 1-based."""
     return f"dron{number}_pos_{fps:g}.csv"
-
-
-def _euler_rad(orientation_wxyz: Orientations) -> Positions:
-    """Angles about x, y, z in radians, with R = Rz Ry Rx."""
-    return Rotation.from_quat(orientation_wxyz, scalar_first=True).as_euler("xyz")
 
 
 def _quaternion_columns(table: Table) -> list[Column]:

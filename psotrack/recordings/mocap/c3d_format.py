@@ -190,12 +190,9 @@ def _read_value(section: bytes, position: int, processor: Processor, name: str) 
     if kind == -1:
         length = shape[0] if shape else 1
         return [_text(data[at : at + length]) for at in range(0, len(data), length)] if length else []
-    numbers = processor.reals(data) if kind == 4 else _integers(data, kind, processor)
+    integers = f"{processor.order}i{kind}"
+    numbers = processor.reals(data) if kind == 4 else np.frombuffer(data, integers).astype(float)
     return numbers.reshape(shape[::-1])
-
-
-def _integers(data: bytes, size: int, processor: Processor) -> np.ndarray:
-    return np.frombuffer(data, f"{processor.order}i{size}").astype(float)
 
 
 def _text(data: bytes) -> str:
