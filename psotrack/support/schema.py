@@ -41,8 +41,8 @@ _TYPE_WORDS = {
 }
 #: Longest part of a wrong value that a message quotes, characters.
 _QUOTED = 60
-#: Least similarity of a name that is suggested (`difflib`): a wrong letter in four.
-_SIMILAR = 0.75
+#: Least similarity of a name that is suggested (`difflib`): a wrong letter in three.
+_SIMILAR = 0.65
 
 
 def convert(data: dict[str, Any], kind: type[Record], error: MakeError) -> Record:
@@ -214,8 +214,8 @@ def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> Non
 def did_you_mean(name: str, names: Iterable[str]) -> str:
     """The question after the name in `names` that was probably meant, for messages; "" if there is none.
 
-    That is the name with the same letters, or else the most similar one of about this length, compared as a whole or by
-    its last part where names have dots; or the only one that begins with `name`.
+    That is the most similar name of about this length, compared as a whole or by its last part where names have dots;
+    or the only one that begins with `name`.
     """
     last_parts = {other.rpartition(".")[2]: other for other in names}
     wholes = {other: other for other in last_parts.values()}
@@ -223,8 +223,7 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     for word, others in ((name, wholes), (last, last_parts)):
         # "median" is similar to "mean", but is another word and no slip.
         near = [other for other in others if abs(len(other) - len(word)) <= -(-len(word) // 4)]
-        swapped = [other for other in near if sorted(other) == sorted(word)]
-        if close := swapped or difflib.get_close_matches(word, near, 1, _SIMILAR):
+        if close := difflib.get_close_matches(word, near, 1, _SIMILAR):
             return f"did you mean {others[close[0]]}?"
     begun = [other for part, other in last_parts.items() if len(last) > 2 and part.startswith(last)]
     return f"did you mean {begun[0]}?" if len(begun) == 1 else ""

@@ -50,12 +50,9 @@ def write_c3d_tracks(path: Path, trajectories: Trajectories, footage: Footage | 
     """Write one point per drone; frames in which a drone is not seen have a residual of -1.
 
     Raises:
-        InputError: no drone is ever seen.
         SettingsError: there are more frames than the format can hold.
         OutputError: the file cannot be written.
     """
-    if not trajectories.seen.any():
-        raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
     frames = int(trajectories.frame[-1]) + 1
     position_m = np.full((frames, trajectories.num_drones, 3), np.nan)
     position_m[trajectories.frame] = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
@@ -279,9 +276,9 @@ def export_tracks(
     if TIMES in lost and (own_s := own_interval_s([trajectories])):
         trajectories = replace(trajectories, frame=np.round(trajectories.time_s / own_s).astype(np.int64))
         lost = _lost_quantities(trajectories, form)
+    if not len(kept) and STATUS not in form.holds:
+        raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
     if not form.needs_all:
-        if not len(kept):
-            raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
         trajectories = trajectories.of_drones(kept.tolist())
         if footage is not None and footage.size_m is not None:
             footage = replace(footage, size_m=footage.size_m[kept])

@@ -214,8 +214,6 @@ def _body_poses(
     """Poses of one body in every frame, and which are bridged; NaN if the shape of its cross cannot be learned."""
     ever_seen = np.isfinite(markers.position_m).all(axis=-1).any(axis=0)
     used = [column for column in columns if ever_seen[column]]
-    if len(used) < len(columns):
-        _logger.info("%s: %d markers of %s were never seen", where, len(columns) - len(used), name)
     try:
         if used:
             position_m = markers.position_m[:, used]
