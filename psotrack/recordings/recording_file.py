@@ -153,7 +153,7 @@ def read_recording_file(path: Path | str) -> RecordingFile:
     _check_names(path, tables)
     # Each table is converted by itself, because msgspec's messages do not name the key of a mapping.
     cameras = {name: _read_camera(path, name, table) for name, table in tables.items()}
-    content = convert({**data, "cameras": {}}, RecordingFile, lambda *parts: file_error(path, *parts))
+    content = convert({**data, "cameras": {}}, RecordingFile, f"{path}, ")
     if content.calibration_unit is not None and content.calibration is None:
         raise file_error(path, "calibration", "a rig file, because there is a calibration_unit", "none")
     _check_bounds(path, content.world)
@@ -164,7 +164,7 @@ def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
     place = f"cameras.{name}"
     if not isinstance(table, dict):
         raise file_error(path, place, f"a table [{place}]", f"{table!r}")
-    camera = convert(table, CameraTable, lambda field, *parts: file_error(path, f"{place}.{field}", *parts))
+    camera = convert(table, CameraTable, f"{path}, {place}.")
     for one, other in _EXCLUSIVE:
         if table.get(one) is not None and table.get(other) is not None:
             raise file_error(path, place, f"{one} or {other}", "both")

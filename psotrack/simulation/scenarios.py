@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import SettingsError
 from psotrack.support import NotNegative, Positive, Share, assign, convert, read_toml
 
 _PRESETS = resources.files("psotrack.simulation.presets")
@@ -527,11 +527,7 @@ def load(path: str | Path) -> Scenario:
     Raises:
         InputError: the file cannot be read, is not valid TOML, or has a wrong field; the message names the field.
     """
-
-    def error(field: str, expected: str, found: str, remedy: str) -> InputError:
-        return InputError(f"{path}: {field}", expected=expected, found=found, remedy=remedy)
-
-    recipe = convert(read_toml(path), Scenario, error)
+    recipe = convert(read_toml(path), Scenario, f"{path}: ")
     folder = Path(path).resolve().parent
     return msgspec.structs.replace(recipe, drones=tuple(_located(drone, folder) for drone in recipe.drones))
 
@@ -547,14 +543,10 @@ def change_scenario(recipe: Scenario, changes: Mapping[str, Any]) -> Scenario:
     Raises:
         SettingsError: a field does not exist, or a value does not fit the field; the message names the field.
     """
-
-    def error(field: str, expected: str, found: str, remedy: str) -> SettingsError:
-        return SettingsError(field, expected=expected, found=found, remedy=remedy)
-
     data = msgspec.json.decode(msgspec.json.encode(recipe))
     for path, value in changes.items():
-        assign(data, path, value, error)
-    return convert(data, Scenario, error)
+        assign(data, path, value)
+    return convert(data, Scenario, error=SettingsError)
 
 
 def _located(drone: Drone, folder: Path) -> Drone:

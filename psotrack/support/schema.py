@@ -12,7 +12,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from inspect import BoundArguments, Parameter, Signature
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,8 +24,6 @@ from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.support.files import atomic_write, read_text
 from psotrack.support.numbers import MODERATE, is_moderate
 
-#: Function that makes an exception from the field, what was expected, what was found, and the remedy.
-MakeError = Callable[[str, str, str, str], PsotrackError]
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 _MSGSPEC_MESSAGE = re.compile(r"(?P<fault>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
@@ -45,23 +43,26 @@ _QUOTED = 60
 _SIMILAR = 0.65
 
 
-def convert(data: dict[str, Any], kind: type[Record], error: MakeError) -> Record:
+def convert(
+    data: dict[str, Any], kind: type[Record], prefix: str = "", error: type[PsotrackError] = InputError
+) -> Record:
     """Convert plain data to a record and check the data.
 
     Args:
-        data: tables as read from TOML.
+        data: tables as read from TOML or JSON.
         kind: type of the record.
-        error: makes the exception for a wrong field.
+        prefix: what stands before the name of a wrong field in messages, such as the file.
+        error: the exception for a wrong field.
     """
     for path, value in _floats(data, ""):
-        if not math.isfinite(value):
-            raise error(path, "a finite number", f"{value}", "")
         if not is_moderate(value):
-            raise error(path, MODERATE, f"{value}", "")
+            expected = MODERATE if math.isfinite(value) else "a finite number"
+            raise error(f"{prefix}{path}", expected=expected, found=f"{value}")
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as fault:
-        raise error(*_translate(str(fault), data, kind)) from None
+        path, expected, found, remedy = _translate(str(fault), data, kind)
+        raise error(f"{prefix}{path}", expected=expected, found=found, remedy=remedy) from None
 
 
 def check_types(record: msgspec.Struct, prefix: str = "") -> None:
@@ -186,7 +187,7 @@ def write_toml(path: Path | str, tables: Mapping[tuple[str, ...], Mapping[str, A
         temporary.write_text(toml_text(tables), encoding="utf-8")
 
 
-def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> None:
+def assign(data: dict[str, Any], path: str, value: Any) -> None:
     """Set the value at a dotted path in nested tables, in place.
 
     Tables that do not exist yet are created. The names of the fields are not checked here, but by `convert`.
@@ -195,10 +196,12 @@ def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> Non
         data: nested tables.
         path: dotted path, such as `drones[0].model`.
         value: new value.
-        error: makes the exception for a path that cannot exist, such as an index beyond the end of a list.
+
+    Raises:
+        SettingsError: the path cannot exist, such as an index beyond the end of a list.
     """
     *outer, last = _tokens(path) or [path]
-    missing = error(path, "a field of the scenario", "none", "")
+    missing = SettingsError(path, expected="a field of the scenario", found="none")
     container: Any = data
     for token in outer:
         if not _can_hold(container, token):

@@ -113,7 +113,7 @@ class Grid:
     def _record(self, kind: type[msgspec.Struct], data: dict[str, Any], places: Mapping[str, str]) -> Any:
         """A checked record; errors name the place of the wrong value in the file."""
         try:
-            return convert(data, kind, _unplaced)
+            return convert(data, kind, error=SettingsError)
         except SettingsError as fault:
             # The error names the field, perhaps by its last part only, but not the field's place in the file.
             field, _, sentence = str(fault).partition(": expected ")
@@ -190,7 +190,7 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
     data = dict(mapping)
     if isinstance(data.get("sequences"), list | tuple):
         data["sequences"] = [os.fspath(one) if isinstance(one, Path) else one for one in data["sequences"]]
-    file: _File = convert(data, _File, lambda field, *said: _unplaced(f"{where}: {field}", *said))
+    file: _File = convert(data, _File, f"{where}: ", SettingsError)
     with errors_name(f"{where}: first_seed, last run"):
         TrackSettings(seed=file.first_seed + file.runs - 1)
     settings = _table(where, "settings", file.settings, SETTINGS)
@@ -222,10 +222,6 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
     )
     checked.cells()
     return checked
-
-
-def _unplaced(field: str, expected: str, found: str, remedy: str) -> SettingsError:
-    return SettingsError(field, expected=expected, found=found, remedy=remedy)
 
 
 def _table(where: str, place: str, content: Any, names: tuple[str, ...]) -> dict[str, Any]:
@@ -262,7 +258,7 @@ def _nest(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
     """Nested tables from dotted names and values; dotted names that are not among `names` are left out."""
     data: dict[str, Any] = {}
     for name in values.keys() & set(names):
-        assign(data, name, values[name], _unplaced)
+        assign(data, name, values[name])
     return data
 
 

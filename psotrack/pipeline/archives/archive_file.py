@@ -19,13 +19,13 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 
 from psotrack.errors import InputError, OutputError, PsotrackError, system_errors
 from psotrack.settings import TrackSettings
-from psotrack.support import Report, atomic_write, no_progress, read_json, refuse_to_overwrite
+from psotrack.support import Report, atomic_write, convert, no_progress, read_json, refuse_to_overwrite
 
 #: Name of the manifest in the archive and in the unpacked folder.
 MANIFEST_FILE = "psotrack.json"
@@ -35,7 +35,6 @@ FORMAT_VERSION = 1
 FORMAT = "psotrack archive"
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
-_Content = TypeVar("_Content", bound=msgspec.Struct)
 
 
 class PackedVideo(msgspec.Struct, frozen=True, kw_only=True):
@@ -134,7 +133,7 @@ def read_manifest(folder: Path) -> Manifest:
             found=f"version {version}, written by psotrack {data.get('psotrack', 'of an unknown version')}",
             remedy="install a newer psotrack",
         )
-    return _converted(path, data, Manifest, "a whole manifest")
+    return convert(data, Manifest, f"{path}, ")
 
 
 def read_record(tracks: Path) -> TrackRecord:
@@ -146,16 +145,7 @@ def read_record(tracks: Path) -> TrackRecord:
     path, expected = tracks.with_suffix(".json"), "the record of the tracks, which `track` writes"
     if not path.is_file():
         raise InputError(path, expected=expected, found="no such file")
-    return _converted(path, read_json(path, expected), TrackRecord, expected, "track again")
-
-
-def _converted(
-    path: Path, data: dict[str, Any], kind: type[_Content], expected: str, remedy: str = ""
-) -> _Content:
-    try:
-        return msgspec.convert(data, kind)
-    except msgspec.ValidationError as error:
-        raise InputError(path, expected=expected, found=f"{error}", remedy=remedy) from error
+    return convert(read_json(path, expected), TrackRecord, f"{path}, ")
 
 
 #: What becomes a file of an archive: a file, or its content.

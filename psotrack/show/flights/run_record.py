@@ -12,7 +12,6 @@ import msgspec
 import numpy as np
 
 from psotrack.calibration.clocks import reference_for
-from psotrack.errors import InputError
 from psotrack.evaluation import Evaluation, evaluate
 from psotrack.pipeline import TrackedRecording, speed_in_words
 from psotrack.recordings.datasets import open_recording
@@ -152,11 +151,7 @@ def as_run_record(content: dict[str, Any], where: object) -> RunRecord:
     Raises:
         InputError: a part is wrong.
     """
-
-    def wrong(field: str, expected: str, found: str, remedy: str) -> InputError:
-        return InputError(f"{where}, {field}", expected=expected, found=found, remedy=remedy)
-
-    return convert({**content, "whole": content}, RunRecord, wrong)
+    return convert({**content, "whole": content}, RunRecord, f"{where}, ")
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import (
     Silhouettes,
     SilhouetteSettings,
@@ -26,7 +24,7 @@ from psotrack.foreground.silhouettes import (
 )
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.show.flights import TrackedFlight
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, convert, no_progress
 
 _Coverage = UInt8[np.ndarray, "height width"]
 _Image = UInt8[np.ndarray, "height width 3"]
@@ -245,10 +243,6 @@ def _settings(flight: TrackedFlight) -> SilhouetteSettings:
     """The settings of the first tracks with a record of them, else the defaults."""
     for tracks in flight.tracks:
         if tracks.record is not None and "silhouettes" in tracks.record.settings:
-            try:
-                return msgspec.convert(tracks.record.settings["silhouettes"], SilhouetteSettings)
-            except msgspec.ValidationError as error:
-                where = f"{tracks.path.with_suffix('.json')}, settings.silhouettes"
-                expected = "settings of silhouettes"
-                raise InputError(where, expected=expected, found=f"{error}") from error
+            where = f"{tracks.path.with_suffix('.json')}, settings.silhouettes."
+            return convert(tracks.record.settings["silhouettes"], SilhouetteSettings, where)
     return SilhouetteSettings()
