@@ -19,7 +19,7 @@ IMPORT_NAMES = {
 #: Part of a declared distribution: jax, jinja2, matplotlib; and IPython is there where a notebook shows a result.
 NOT_DECLARED = {"markupsafe", "IPython"}
 #: Functions that import the module whose name they are given.
-IMPORTERS = {"import_module", "_library"}
+IMPORTERS = {"import_module", "import_extra"}
 
 
 def declared(extra):
@@ -41,7 +41,7 @@ def imported(folder):
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 found.add(node.module)
             elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in IMPORTERS:
-                found.update(given.value for given in node.args if isinstance(given, ast.Constant))
+                found.update(given.value for given in node.args[:1] if isinstance(given, ast.Constant))
     return frozenset(name.split(".")[0] for name in found)
 
 
