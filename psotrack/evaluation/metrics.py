@@ -105,7 +105,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     kept = partners_per_frame(pair.distance_m, keep=True)
     kept_m = paired_values(pair.distance_m, kept)
     matched_m = paired_values(pair.distance_m, partners_per_frame(pair.distance_m, keep=False))
-
+    _warn_of_millimetres(pair, bool(np.isfinite(matched_m).any()))
     id_switches = int(identity_switches(kept).sum())
     counted = _counted_estimates(pair, partner)
     num_known, num_estimated = int(known.sum()), int(counted.sum())
@@ -134,6 +134,17 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
             for drone, name in enumerate(pair.drones)
         ),
     )
+
+
+def _warn_of_millimetres(pair: AlignedPair, has_matches: bool) -> None:
+    """Warn of tracks that are nowhere near the reference, and would be near it if their unit was the millimetre."""
+    far_m = np.linalg.norm(pair.ref_m[:, :, None] - pair.est_m[:, None] / 1e3, axis=-1)
+    near = far_m[np.isfinite(far_m)] < GATE_M
+    # Of all pairs of a track and a drone, one in as many as there are drones is right.
+    if not has_matches and near.size and near.mean() > 0.5 / max(pair.distance_m.shape[1:]):
+        logger.warning(
+            "the tracks are far away, and near the reference as millimetres: write their positions in metres"
+        )
 
 
 def errors_over_time(traj_est: Trajectories, traj_ref: Trajectories) -> DataFrame:

@@ -142,6 +142,13 @@ class TestTable:
         assert "end with frame 7, the reference with frame 49" in line
         assert "missed in the last 84 % of the frames" in line
 
+    def test_tracks_in_millimetres_are_suspected(self, caplog):
+        est, ref = flights()
+        evaluate(replace(est, position_m=5 + est.position_m), ref)
+        assert not caplog.messages
+        evaluate(replace(est, position_m=1e3 * est.position_m), ref)
+        assert "near the reference as millimetres" in caplog.text
+
 
 @pytest.fixture
 def drawn(monkeypatch):
