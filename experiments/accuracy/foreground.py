@@ -68,7 +68,7 @@ STILL = [f"V_DRONE_{number:03d}" for number in (4, 20, 30, 50, 60, 70, 80, 90, 1
     "V_BIRD_040",
 ]
 #: Least confidences of boxes.
-CONFIDENCES = (0.2, 0.3, 0.4, 0.5)
+CONFIDENCES = (0.2, 0.25, 0.3, 0.4)
 #: Pixels by which the box of a clip is too small at most.
 MARGIN_PX = 3
 
@@ -216,13 +216,13 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[s
 
 
 def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
-    """Print the sequences, and the clips all together."""
+    """Print the sequences, and the clips of drones and of birds together."""
     settings: dict[str, Any] = {"float_format": "{:.3f}".format, "na_rep": "-"}
     if "pixel_f" in table:
         sequences = table[table.pixel_f.notna()].dropna(axis=1, how="all")
         print(sequences.to_string(index=False, **settings))
     if "found" in table:
-        clips = table[table.found.notna()].groupby("method")[["found", "drones", "false", "frames"]].sum()
-        clips["recall"] = clips.found / clips.drones
-        clips["false_per_frame"] = clips["false"] / clips.frames
+        clips = table[table.found.notna()]
+        clips = clips.groupby([clips.case.str[2:6], "method"])[["found", "drones", "false", "frames"]].sum()
+        clips = clips.assign(recall=clips.found / clips.drones, false_per_frame=clips["false"] / clips.frames)
         print(clips.to_string(**settings))

@@ -7,6 +7,7 @@ compression. The probabilities and limits below are guesses: wide enough for pic
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -143,8 +144,9 @@ def _one_more(part: Part, other: Part, random: np.random.Generator) -> Part:
 
 def _hiding(part: Part) -> Float[np.ndarray, "side side 1"]:
     """The share of the background that drones hide."""
-    difference = np.abs(part.image - part.background).max(axis=-1, keepdims=True)
-    return part.covered[..., None] * np.minimum(difference / _OPAQUE, 1)
+    # Several times as fast as the maximum of an array's last axis.
+    difference = functools.reduce(np.maximum, cv2.split(cv2.absdiff(part.image, part.background)))
+    return (part.covered * np.minimum(difference / _OPAQUE, 1))[..., None]
 
 
 def _drones(part: Part) -> _Image:
