@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -53,6 +53,10 @@ class Board:
     legacy: bool = False
 
     def __post_init__(self) -> None:
+        if self.kind not in get_args(BoardKind):
+            raise SettingsError(
+                "board.kind", expected=f"one of {', '.join(get_args(BoardKind))}", found=self.kind
+            )
         if min(self.squares_wh) < (1 if self.kind == "grid" else 3):
             what = "at least one marker" if self.kind == "grid" else "at least 3 x 3 squares"
             raise SettingsError("board.squares_wh", expected=what, found=f"{self.squares_wh}")

@@ -47,6 +47,15 @@ class LensModel:
     coefficients: int = 5
     fisheye: bool = False
 
+    def __post_init__(self) -> None:
+        known = (FISHEYE_COEFFICIENTS,) if self.fisheye else PINHOLE_COEFFICIENTS
+        if self.coefficients not in known:
+            raise SettingsError(
+                "lens",
+                expected=f"one of {', '.join(map(str, known))} coefficients",
+                found=f"{self.coefficients}",
+            )
+
     def __str__(self) -> str:
         """The word that `parse_lens_model` reads."""
         return "fisheye" if self.fisheye else f"{self.coefficients}"

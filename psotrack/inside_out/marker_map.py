@@ -28,6 +28,9 @@ SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -
 SQUARE_TOLERANCE = 0.06
 #: Smallest and largest side of a marker, metres. A table in millimetres that is read as metres is far above.
 _SIDES_M = (0.005, 5.0)
+#: Distance of two centres, in sides, below which two markers that face the same way are at the same place. The two
+#: markers on the front and the back of a board face opposite ways.
+_SAME_PLACE = 0.5
 #: Distance from a marker's plane, in sides, below which another marker is neither before nor behind it.
 _IN_PLANE = 1.0
 #: Largest width, in sides, of an object with markers on its outside. A room is wider.
@@ -138,10 +141,22 @@ def read_marker_table(path: Path | str) -> MarkerMap | MarkerCentres:
     """Read a map from a table of corners, or centres from a table with the columns id, x_m, y_m and z_m.
 
     Raises:
-        InputError: as `read_marker_map`.
+        InputError: as `read_marker_map`; or two centres are at one place.
     """
     centres_m = read_marker_centres(path)
-    return read_marker_map(path) if centres_m is None else MarkerCentres(centres_m)
+    if centres_m is None:
+        return read_marker_map(path)
+    places: dict[tuple[float, ...], int] = {}
+    for marker, centre_m in centres_m.items():
+        other = places.setdefault(tuple(centre_m.tolist()), marker)
+        if other != marker:
+            raise InputError(
+                path,
+                expected="markers in different places",
+                found=f"the centre of marker {other} for marker {marker} as well",
+                remedy="correct one of the two",
+            )
+    return MarkerCentres(centres_m)
 
 
 def read_marker_map(path: Path | str) -> MarkerMap:
@@ -149,7 +164,8 @@ def read_marker_map(path: Path | str) -> MarkerMap:
 
     Raises:
         InputError: the file cannot be read, a corner or column is missing, or a marker is listed twice, is no flat
-            square of the size of a marker, or all markers face out of the room. The message names the line.
+            square of the size of a marker, or is at the place of another marker, or all markers face out of the
+            room. The message names the line.
     """
     path = Path(path)
     rows = read_marker_rows(path)
@@ -159,6 +175,7 @@ def read_marker_map(path: Path | str) -> MarkerMap:
         {marker: row.corners_m for marker, row in rows.items()},
         {marker: row.std_m for marker, row in rows.items() if row.std_m},
     )
+    _check_apart(rows, marker_map)
     _check_facing(path, marker_map)
     return marker_map
 
@@ -273,6 +290,20 @@ def check_square(
             remedy="measure its corners again",
         )
     return square
+
+
+def _check_apart(rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:
+    ids, centres, faces = marker_map.ids, marker_map.centres_m, marker_map.normals
+    distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    limit = _SAME_PLACE * np.minimum(marker_map.sides_m[:, None], marker_map.sides_m)
+    pairs = np.argwhere(np.triu((distance < limit) & (faces @ faces.T > 0), 1))
+    for first, second in ids[pairs].tolist():
+        raise InputError(
+            f"{rows[second].where}, marker {second}",
+            expected="markers in different places",
+            found=f"both markers at the place of marker {first}",
+            remedy="correct one of the two",
+        )
 
 
 def _check_facing(path: Path, marker_map: MarkerMap) -> None:

@@ -43,7 +43,7 @@ from psotrack.inside_out.filtering import Agility, FilterRun, poses_of, step
 from psotrack.inside_out.lens_files import choose_lens
 from psotrack.inside_out.mapping import complete_map
 from psotrack.inside_out.mapping.sightings import collect_sightings
-from psotrack.inside_out.pose import estimate_pose
+from psotrack.inside_out.pose import CornerNoise, estimate_pose
 from psotrack.recordings.mocap import Markers, write_c3d
 
 ROOM = four_walls()
@@ -179,6 +179,7 @@ BAD = {
     "not planar": (reads(third(bent(0.05, 1))), "line 4, marker 3", "a flat square", "25 mm off"),
     "not square": (reads(third(bent(0.06, 0))), "a flat square", "corners 4", "the side is 4"),
     "crossed": (reads(third(ROOM[3][[0, 1, 3, 2]])), "line 4, marker 3", "one after the other"),
+    "same place": (reads(third(ROOM[2] + 0.01)), "line 4, marker 3", "both markers at the place of marker 2"),
     "one in mm": (reads(third(1e3 * ROOM[3])), "line 4, marker 3", "found 400 m; is it in mill", "x1[mm]"),
     "mirrored": (reads(MIRRORED), "16 of 16 markers face out of the room", "an axis is mirrored"),
     "not finite": (calls(MarkerMap, {5: np.full((4, 3), np.nan)}), "marker 5: expected finite corners"),
@@ -203,6 +204,9 @@ BAD = {
     "no coordinates": (calls(estimate_pose, *NOWHERE, PoseSettings()), "finite coordinates"),
     "min_markers": (calls(PoseSettings, min_markers=0), "min_markers: expected at least 1, found 0"),
     "focal_error": (calls(PoseSettings, focal_error=-0.1), "a number from 0 to below 1, found -0.1"),
+    "scale": (calls(CornerNoise, scale=0.0), "scale"),
+    "longest_gap_s": (calls(PoseFilterParams, longest_gap_s=-1.0), "a number above 0, found -1"),
+    "confirm": (calls(PoseFilterParams, confirm=0), "confirm: expected at least 1, found 0"),
     "earlier frame": (calls(STEPPED, BEGUN, 0.0, poses_of(PATH)[1]), "a time after 0.04 s, found 0 s"),
     "no error": (calls(smooth, UNSURE), "covariance at 0 s: expected a positive definite matrix"),
     # Fusion.

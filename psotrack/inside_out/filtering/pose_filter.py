@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri, gammaln
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath, Flag
 from psotrack.inside_out.filtering import motion as pose_motion
@@ -61,6 +61,12 @@ class PoseFilterParams:
     longest_gap_s: float = 0.5
     confirm: int = 3
     restart_after: int = 10
+
+    def __post_init__(self) -> None:
+        check_positive("longest_gap_s", self.longest_gap_s)
+        for name in ("confirm", "restart_after"):
+            if getattr(self, name) < 1:
+                raise SettingsError(name, expected="at least 1", found=f"{getattr(self, name)}")
 
     def within(self, num_frames: int | None) -> PoseFilterParams:
         """Parameters for a recording of `num_frames` frames: `confirm` is at most this number. None is a stream."""

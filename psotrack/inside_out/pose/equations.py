@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import NEAR_M, Camera, cross_matrices, to_pixels_with_jacobian
 
 #: Standard deviation of a marker's mean error by edges, as a multiple of that of independent corners. With points over
@@ -202,6 +202,10 @@ class CornerNoise:
     scale: float = 1.0
     place_m: float = 0.0003
     shift_px: float = 0.015
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "place_m", "shift_px"):
+            check_positive(name, getattr(self, name))
 
 
 @dataclass(frozen=True)
