@@ -35,7 +35,7 @@ from psotrack.foreground.silhouettes import (
 from psotrack.recordings import open_video, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
-from psotrack.support import progress_bar
+from psotrack.support import evenly_spread, progress_bar
 from psotrack.trajectories import read_trajectories
 
 METHODS = ("mog2", "living", "network")
@@ -125,7 +125,7 @@ def _pixels(recording: Any, method: str, data: Path) -> dict[str, float]:
     samples = gather(recording, settings, per_camera=PER_CAMERA, cache=data / "silhouettes", jobs=2)
     counts, blobs = np.zeros(3), np.zeros(4)
     for (_, video), shown in list(zip(recording.videos.items(), samples, strict=True))[:CAMERAS]:
-        frames = np.unique(np.linspace(0, video.num_frames - 1, PER_CAMERA).round().astype(int)).tolist()
+        frames = evenly_spread(video.num_frames, PER_CAMERA).tolist()
         learning = read_frames(video, learning_step(video.num_frames, settings))
         found_in = enumerate(find_background(method, settings).foreground(learning, read_frames(video)))
         masks = [mask for number, mask in found_in if number in frames]

@@ -62,7 +62,12 @@ class BoardFinder:
     def find(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
         """Pixels of the board's corners, (corners, 2); NaN where a corner is not found, everywhere if few are."""
         found = np.full((self.board.num_corners, 2), np.nan)
-        getattr(self, f"_find_{self.board.kind}")(grey, found)
+        if self.board.kind == "chessboard":
+            self._find_chessboard(grey, found)
+        elif self.board.kind == "grid":
+            self._find_grid(grey, found)
+        else:
+            self._find_charuco(grey, found)
         seen = np.isfinite(found[:, 0])
         if seen.sum() < self.board.least_corners or _on_a_line(found[seen]):
             found[:] = np.nan

@@ -332,6 +332,16 @@ def test_it_serves_as_background_model_and_detector(trained):
     assert len(own) <= len(confidence)
 
 
+def test_a_box_in_which_nothing_moves_has_half_of_the_confidence(trained):
+    """An image that differs from its background by 9 grey levels everywhere stands still, and one by 10 does not."""
+    network, image = model_at(trained).network, np.clip(pictures().image[0], 0, 200)
+    _, still_px, still = findings(network, image, image + np.uint8(9), 0.05)
+    _, moving_px, moving = findings(network, image, image + np.uint8(10), 0.05)
+    np.testing.assert_allclose(still_px[0], moving_px[0], atol=1)
+    # One grey level more changes what the network itself tells by a few per cent.
+    assert moving[0] / still[0] == pytest.approx(2, rel=0.15)
+
+
 @pytest.mark.slow
 def test_the_network_of_the_package_finds_drones_that_stay(tmp_path):
     """Drones that never move are background to "living"; nothing of these flights is in the network's training."""

@@ -188,7 +188,7 @@ class OnnxDetector:
         if layout == "yolox":
             corner, width = self._cells(len(table))
             middle, half = (middle + corner) * width, np.exp(table[:, 2:4]) * width / 2
-        elif (half < 0).any():
+        elif layout == "v5" and (half < 0).any():
             expected, found = "boxes with sizes above 0", f"{2 * half.min():.3g}, as of YOLOX"
             raise InputError(self.model, expected=expected, found=found, remedy=_SAY_LAYOUT)
         return np.hstack([middle - half, middle + half]), score

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from psotrack.foreground.detection.detector import FoundBoxes, usable_boxes
 from psotrack.foreground.detection.settings import DetectorSettings
-from psotrack.foreground.network import findings, model_at
+from psotrack.foreground.network import FINDING_VERSION, findings, model_at
 from psotrack.foreground.silhouettes import ForegroundSettings, learned_mog2, learning_step, reduce_frame
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import digest_file
@@ -42,7 +42,8 @@ class NetworkDetector:
     @property
     def key(self) -> Mapping[str, Any]:
         """See `Detector`."""
-        return {"model": digest_file(self.model), "settings": msgspec.to_builtins(self.settings)}
+        settings = msgspec.to_builtins(self.settings)
+        return {"finding": FINDING_VERSION, "model": digest_file(self.model), "settings": settings}
 
     def of_video(self, video: VideoInfo) -> NetworkDetector:
         """The detector for the frames of one video, whose background it learns."""

@@ -32,7 +32,15 @@ from psotrack.foreground.silhouettes import (
 )
 from psotrack.recordings import Recording, VideoInfo, digest_video, read_frames
 from psotrack.recordings.datasets import MASKS
-from psotrack.support import Advance, Report, atomic_write, digest_record, map_in_processes, no_progress
+from psotrack.support import (
+    Advance,
+    Report,
+    atomic_write,
+    digest_record,
+    evenly_spread,
+    map_in_processes,
+    no_progress,
+)
 
 #: Version of the stored samples.
 _VERSION = 3
@@ -83,7 +91,7 @@ class Samples:
 
     def thinned(self, most: int) -> Samples:
         """Some of the samples, spread over the video."""
-        chosen = np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).round().astype(int))
+        chosen = evenly_spread(len(self), most)
         image, covered, box_px = (each[chosen] for each in (self.image, self.covered, self.box_px))
         return Samples(image, self.background, covered, box_px, self.key, self.by_boxes)
 
@@ -160,8 +168,7 @@ def gather(
         raise InputError(recording.folder, expected=expected, found="none", remedy=remedy)
     tasks = []
     for name, video in recording.videos.items():
-        count = min(per_camera, video.num_frames)
-        frames = np.unique(np.linspace(0, video.num_frames - 1, count).round().astype(int))
+        frames = evenly_spread(video.num_frames, per_camera)
         boxes_px = None if tracked is None else tracked.boxes_px(recording, name, frames)
         shown = [masks.stat().st_size, masks.stat().st_mtime_ns] if boxes_px is None else boxes_px.tolist()
         key = {

@@ -132,14 +132,12 @@ def train(
     steps = settings.epochs * settings.steps
     teacher = Teacher(settings.learning_rate, steps, settings.seed)
     unfinished = out.with_suffix(_STATE_SUFFIX)
-    path = model_path(settings.start or NETWORK)
-    if path is None:
-        expected = f"{NETWORK}, or a file of `psotrack train` that ends in {MODEL_SUFFIX}"
-        raise SettingsError("start", expected=expected, found=f"{settings.start}")
-    start = model_at(path) if settings.start else None
-    about = {**about, "start": digest_file(path) if start else None}
+    start = None if settings.start is None else _start(settings.start)
+    about = {**about, "start": None if start is None else digest_file(start)}
     of = digest_record({"settings": msgspec.to_builtins(settings), "about": about})
-    state, history = _resumed(unfinished, teacher.begin(start.network if start else None), of)
+    state, history = _resumed(
+        unfinished, teacher.begin(None if start is None else model_at(start).network), of
+    )
     with report("train", steps) as advance, ThreadPoolExecutor(1) as ahead:
         advance(len(history) * settings.steps)
         while len(history) < settings.epochs and _since_best(history) < settings.patience:
@@ -183,6 +181,15 @@ def _check(samples: Sequence[Samples], part: str) -> None:
         raise InputError(
             f"samples for {part}", expected="frames that show a scene", found="frames of one colour"
         )
+
+
+def _start(name: str) -> Path:
+    """The file of the network from which a training goes on."""
+    path = model_path(name)
+    if path is None:
+        expected = f"{NETWORK}, or a file of `psotrack train` that ends in {MODEL_SUFFIX}"
+        raise SettingsError("start", expected=expected, found=name)
+    return path
 
 
 def _resumed(path: Path, first: State, of: str) -> tuple[State, list[dict[str, float]]]:

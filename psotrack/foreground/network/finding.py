@@ -11,12 +11,14 @@ from jaxtyping import Array, Bool, Float, UInt8
 from psotrack.foreground.network.network import CELL_PX, MULTIPLE, Found, Network, inputs_of
 from psotrack.support import as_written
 
+#: Version of the findings: what is stored of another version is not used again.
+FINDING_VERSION = 2
 #: Confidence from which on a box counts where the caller names none.
 USUAL_CONFIDENCE = 0.3
-#: Where nine of ten pixels of a box differ from the background by less than this, grey levels, nothing moves: boxes on
-#: drones that hover differ more (their rotors turn and they sway), in 97 of 100 simulated ones and in published videos.
+#: A box of which nine of ten pixels differ from the background by less, grey levels, shows nothing that moves. Chosen
+#: on published clips and simulated drones: those that hover differ more, because rotors turn and drones sway.
 _STANDS_STILL = 10.0
-#: Factor of the confidence of such a box: it is mostly a thing of the scene that looks like a drone.
+#: Factor of the confidence of such a box, which is mostly about a thing of the scene that looks like a drone.
 _DOUBT = 0.5
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.foreground.network import findings, model_at
+from psotrack.foreground.network import FINDING_VERSION, findings, model_at
 from psotrack.foreground.silhouettes.foreground import OwnBackground, learned_mog2, remove_speckle
 from psotrack.foreground.silhouettes.living_background import Living
 from psotrack.support import digest_file
@@ -48,7 +48,12 @@ class NetworkBackground(OwnBackground):
     @property
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
-        return {"network": 3, "model": digest_file(self.model), **Living(self.settings).key}
+        return {
+            "network": 3,
+            "finding": FINDING_VERSION,
+            "model": digest_file(self.model),
+            **Living(self.settings).key,
+        }
 
     def masks(
         self, learning: Iterable[tuple[float, _Image]], frames: Iterable[_Image]

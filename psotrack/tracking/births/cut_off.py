@@ -7,6 +7,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, viewpoints
+from psotrack.support import evenly_spread
 from psotrack.tracking.births.moving_volume import FlightVolume
 from psotrack.tracking.matching import Sightings, from_silhouettes, match, wide_bounds
 from psotrack.trajectories import Status, Tracks
@@ -84,8 +85,7 @@ def count_common(rig: Rig, found: Sightings | Silhouettes) -> tuple[int, int]:
     """
     viewpoint, wide_m = viewpoints(rig.cameras), wide_bounds(rig)
     seen = met = 0
-    spread = np.linspace(0, found.num_frames - 1, min(found.num_frames, _FRAMES))
-    frames = np.unique(spread.round().astype(int))
+    frames = evenly_spread(found.num_frames, _FRAMES)
     sightings = found[frames] if isinstance(found, Sightings) else from_silhouettes(found, frames=frames)
     for number in range(len(frames)):
         view = sightings[number].largest(_MOST_SIGHTINGS)

@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, viewpoints
 from psotrack.settings import USUAL_SPEED_M_S
+from psotrack.support import evenly_spread
 from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, FlightLimits, TrackCandidate
 from psotrack.tracking.births.initial_state import room_bounds
 from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
@@ -226,7 +227,7 @@ def moving_points(
         count = min(WINDOWS, math.ceil(windows_long))
     last = 0 if not len(frames) else int(frames[-1])
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
-    starts = starts[np.unique(np.linspace(0, len(starts) - 1, min(count, len(starts))).round().astype(int))]
+    starts = starts[evenly_spread(len(starts), count)]
     points, limits = [], FlightLimits(fps / step, wide_bounds(rig), FASTEST_M_S)
     # The last window ends at the last of the frames.
     windows = [
