@@ -1,7 +1,7 @@
 """A sequence by another renderer than the simulator's: Cycles, the path tracer of Blender.
 
     pip install bpy==4.2.0                            # Blender as a package, for Python 3.11
-    python experiments/rendered.py --data data        # DATA/rendered/Simulated_Data/R01_D4, ten minutes on two cores
+    python experiments/rendered.py --data data        # DATA/rendered/Simulated_Data/R01_D4, 20 minutes on two cores
     python experiments/accuracy/accuracy.py foreground --data data --only rendered \
         --rendered data/rendered/Simulated_Data/R01_D4
 
@@ -32,7 +32,7 @@ FPS = 2.5
 #: Corners of the room from which the cameras look at its middle, metres.
 CORNERS_M = ((4.2, 3.2, 2.9), (-4.2, 3.2, 2.2), (-4.2, -3.2, 3.0))
 #: Samples of light per pixel of a picture and of a mask, and share of the light that rotors let through.
-SAMPLES, MASK_SAMPLES, THROUGH = 6, 2, 0.8
+SAMPLES, MASK_SAMPLES, THROUGH = 10, 16, 0.8
 #: Least opacity of a drone's pixel in a mask.
 LEAST_OPACITY = 0.5
 
@@ -59,7 +59,7 @@ def main() -> None:
         raise SystemExit(f"rendered: {folder}: expected no such folder; delete it to render it again")
     options.data.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=options.data) as temporary:
-        settings = SimulationSettings(num_frames=options.frames, scale=0.25, seed=3, onboard=False)
+        settings = SimulationSettings(num_frames=options.frames, scale=0.5, seed=3, onboard=False)
         simulate(drawn, Path(temporary), settings, report=progress_bar)
         made = Path(temporary) / "Simulated_Data" / drawn.name
         render(drawn, made)
@@ -154,6 +154,8 @@ def _room(bpy: Any) -> Any:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene, choice = bpy.context.scene, random.Random(5)
     scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", SAMPLES, 2
+    # A pixel is the mean of the light in it, and a mask tells whether half of a pixel is covered.
+    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BOX", 1.0
     scene.view_settings.view_transform = "Standard"
     scene.world = bpy.data.worlds.new("sky")
     walls = [

@@ -342,6 +342,27 @@ def test_a_box_in_which_nothing_moves_has_half_of_the_confidence(trained):
     assert moving[0] / still[0] == pytest.approx(2, rel=0.15)
 
 
+def test_as_background_model_it_tells_what_it_or_living_sees_in_boxes(trained):
+    shown = pictures()
+    learning, frames = [shown.background] * 4, list(shown.image)
+    settings = ForegroundSettings(reduction=1, working_reduction=1, min_blob_px=1)
+    network = model_at(trained).network
+    told, living = (
+        list(find_background(name, settings).foreground(learning, frames))
+        for name in (str(trained), "living")
+    )
+    for mask, differs, image in zip(told, living, frames, strict=True):
+        share, boxes, _ = findings(network, image, shown.background)
+        assert len(boxes) == 2
+        either = np.maximum(differs, np.where(share >= 0.5, np.round(255 * share), 0))
+        near = np.zeros(mask.shape, bool)
+        for x0, y0, x1, y1 in np.clip(np.round(boxes), 0, SIDE).astype(int):
+            np.testing.assert_array_equal(mask[y0:y1, x0:x1], either[y0:y1, x0:x1])
+            wide, high = x1 - x0, y1 - y0
+            near[max(y0 - high, 0) : y1 + high, max(x0 - wide, 0) : x1 + wide] = True
+        assert not mask[~near].any()
+
+
 @pytest.mark.slow
 def test_the_network_of_the_package_finds_drones_that_stay(tmp_path):
     """Drones that never move are background to "living"; nothing of these flights is in the network's training."""
