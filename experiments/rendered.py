@@ -33,8 +33,6 @@ FPS = 2.5
 CORNERS_M = ((4.2, 3.2, 2.9), (-4.2, 3.2, 2.2), (-4.2, -3.2, 3.0))
 #: Samples of light per pixel of a picture and of a mask, and share of the light that rotors let through.
 SAMPLES, MASK_SAMPLES, THROUGH = 10, 16, 0.8
-#: Least opacity of a drone's pixel in a mask.
-LEAST_OPACITY = 0.5
 
 
 def recipe() -> Scenario:
@@ -121,7 +119,8 @@ def _masks(bpy: Any, scene: Any, drones: list[Any], picture: str) -> list[np.nda
             each.is_holdout = each not in (drone, *drone.children)
         bpy.ops.render.render(write_still=True)
         opacity = cv2.imread(picture, cv2.IMREAD_UNCHANGED)[..., 3]
-        found.append(np.where(opacity >= 255 * LEAST_OPACITY, 255, 0).astype(np.uint8))
+        # A drone's pixels are those of which it covers a half at least.
+        found.append(np.where(opacity >= 128, 255, 0).astype(np.uint8))
     for each in scene.objects:
         each.is_holdout = False
     through.default_value = 1 - THROUGH

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +63,12 @@ TREMBLE_PX = 2.0
 #: Frames of each camera, and cameras, whose pixels and blobs are compared.
 PER_CAMERA, CAMERAS = 10, 4
 CLIPS = "DroneDetectionThesis/Drone-detection-dataset"
-STILL = [f"V_DRONE_{number:03d}" for number in (4, 20, 30, 50, 60, 70, 80, 90, 100)] + [
-    "V_BIRD_022",
-    "V_BIRD_040",
-]
+#: Clips before cameras that stand still; the second group is of drones, too, but nothing was chosen on it.
+STILL = {
+    "drones": [f"V_DRONE_{number:03d}" for number in (4, 20, 30, 50, 60, 70, 80, 90, 100)],
+    "held out": [f"V_DRONE_{number:03d}" for number in (2, 6, 8, 12, 16, 18, 22, 24)],
+    "birds": ["V_BIRD_022", "V_BIRD_040"],
+}
 #: Least confidences of boxes.
 CONFIDENCES = (0.2, 0.25, 0.3, 0.4)
 #: Pixels by which the box of a clip is too small at most.
@@ -92,8 +94,7 @@ def tremble(path: Path, random: np.random.Generator) -> None:
     """Move each frame of a video by up to 2 pixels."""
     video = open_video(path)
     frames = [np.asarray(frame) for frame in read_frames(video)]
-    code = cv2.VideoWriter.fourcc(*"MJPG")
-    writer = cv2.VideoWriter(str(path), code, video.fps, video.image_size_wh)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), video.fps, video.image_size_wh)
     writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 95)
     for frame in frames:
         by = np.column_stack([np.eye(2), random.uniform(-TREMBLE_PX, TREMBLE_PX, 2)])
@@ -120,18 +121,16 @@ def tracked(name: str, method: str, made: Callable[[], Path], data: Path) -> dic
 
 
 def _pixels(recording: Any, method: str, data: Path) -> dict[str, float]:
-    chosen = SilhouetteSettings(background=method)
-    settings = scaled_settings(chosen, recording)
+    settings = scaled_settings(SilhouetteSettings(background=method), recording)
     samples = gather(recording, settings, per_camera=PER_CAMERA, cache=data / "silhouettes", jobs=2)
     counts, blobs = np.zeros(3), np.zeros(4)
-    for (_, video), shown in list(zip(recording.videos.items(), samples, strict=True))[:CAMERAS]:
+    for video, shown in list(zip(recording.videos.values(), samples, strict=True))[:CAMERAS]:
         frames = evenly_spread(video.num_frames, PER_CAMERA).tolist()
         learning = read_frames(video, learning_step(video.num_frames, settings))
         found_in = enumerate(find_background(method, settings).foreground(learning, read_frames(video)))
         masks = [mask for number, mask in found_in if number in frames]
         for mask, covered, truth in zip(masks, shown.covered, shown.box_px, strict=True):
-            if mask is None:
-                mask = np.zeros(covered.shape, np.uint8)
+            mask = np.zeros(covered.shape, np.uint8) if mask is None else mask
             mask = cv2.resize(mask, covered.shape[::-1], interpolation=cv2.INTER_LINEAR)
             found, drawn = mask >= 128, covered >= 128
             counts += (found & drawn).sum(), found.sum(), drawn.sum()
@@ -155,7 +154,13 @@ def _matched(boxes: np.ndarray, truth: np.ndarray, margin_px: int) -> tuple[int,
     return int(inside.any(axis=0).sum()), len(truth), int((~inside.any(axis=1)).sum()), 1
 
 
-def clip(name: str, method: str, confidence: float, real: Path, layout: Any = None) -> dict[str, Any]:
+@lru_cache(maxsize=1)
+def _detected(method: str, layout: Any, path: Path) -> Any:
+    detector = find_detector(method, DetectorSettings(size=640, confidence=0.03, layout=layout))
+    return detect_drones(detector, path.stem, open_video(path))
+
+
+def clip(name: str, group: str, method: str, confidence: float, real: Path, layout: Any) -> dict[str, Any]:
     """A clip by a background model, or by the boxes of a detector with a least confidence."""
     from mcos_decoder import load_groundtruth  # pip install mcos-decoder
 
@@ -165,20 +170,19 @@ def clip(name: str, method: str, confidence: float, real: Path, layout: Any = No
     labels = labels[max(len(labels) - video.num_frames, 0) :]
     total = np.zeros(4)
     if confidence:
-        detector = find_detector(method, DetectorSettings(size=640, confidence=confidence, layout=layout))
-        told = detect_drones(detector, name, video)
-        found = (told.in_frame(number).xyxy for number in range(video.num_frames))
+        told = map(_detected(method, layout, path).in_frame, range(video.num_frames))
+        found = (each.xyxy[each.confidence >= confidence] for each in told)
     else:
         settings = ForegroundSettings(reduction=1, working_reduction=1, min_blob_px=9)
         learning = read_frames(video, learning_step(video.num_frames, settings))
         masks = find_background(method, settings).foreground(learning, read_frames(video))
         found = (np.zeros((0, 4)) if mask is None else _blobs(mask) for mask in masks)
     for boxes, label in zip(found, labels, strict=False):
-        box = np.zeros((0, 4)) if label is None or "BIRD" in name else np.array([label], float)
+        box = np.zeros((0, 4)) if label is None or group == "birds" else np.array([label], float)
         total += _matched(boxes, np.hstack([box[:, :2], box[:, :2] + box[:, 2:]]), MARGIN_PX)
     shown = f"{method} boxes at {confidence}" if confidence else method
     counts = dict(zip(("found", "drones", "false", "frames"), total.astype(int).tolist(), strict=True))
-    return {"case": name, "method": shown, **counts}
+    return {"case": name, "group": group, "method": shown, **counts}
 
 
 def add_options(options: argparse.ArgumentParser) -> None:
@@ -209,10 +213,9 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[s
     searches += [(each, confidence, None) for each in networks for confidence in CONFIDENCES]
     if options.detector:
         searches += [(options.detector, confidence, options.layout) for confidence in (0.03, 0.1, 0.3)]
-    for name in filter(is_chosen, STILL):
-        for method, confidence, layout in searches:
-            row = partial(clip, name, method, confidence, options.real, layout)
-            yield f"{name}:{method}:{confidence}", row
+    for name, group in ((name, group) for group, names in STILL.items() for name in filter(is_chosen, names)):
+        for method, least, layout in searches:
+            yield f"{name}:{method}:{least}", partial(clip, name, group, method, least, options.real, layout)
 
 
 def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
@@ -223,6 +226,6 @@ def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
         print(sequences.to_string(index=False, **settings))
     if "found" in table:
         clips = table[table.found.notna()]
-        clips = clips.groupby([clips.case.str[2:6], "method"])[["found", "drones", "false", "frames"]].sum()
+        clips = clips.groupby(["group", "method"])[["found", "drones", "false", "frames"]].sum()
         clips = clips.assign(recall=clips.found / clips.drones, false_per_frame=clips["false"] / clips.frames)
         print(clips.to_string(**settings))
