@@ -2,7 +2,8 @@
 
 "living" tells contours sharply, but is blind for parts that look like the background and for drones that it has learned
 as background, and knows people and leaves as foreground. In and near each box that the network finds, the foreground is
-what either of both tells; elsewhere there is none.
+what either of both tells; elsewhere there is none. A box in which "living" sees something has two witnesses, and needs
+less confidence.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.foreground.network import FINDING_VERSION, findings, model_at
+from psotrack.foreground.network import FINDING_VERSION, USUAL_CONFIDENCE, findings, model_at
 from psotrack.foreground.silhouettes.foreground import OwnBackground, learned_mog2, remove_speckle
 from psotrack.foreground.silhouettes.living_background import Living
 from psotrack.support import digest_file
@@ -25,6 +26,9 @@ from psotrack.support import digest_file
 #: Pixels count whose probability is at least this share. Those of a smaller one are a rim about the drone, which made
 #: errors larger on simulated flights.
 _LEAST_SHARE = 0.5
+#: Least confidence of a box in which "living" sees more than a share of the pixels, that share, and least confidence of
+#: other boxes. Chosen on the clips and flights of `experiments/accuracy/foreground.py`.
+_SEEN, _SEEN_SHARE, _UNSEEN = 0.2, 0.02, USUAL_CONFIDENCE
 #: Pixels this share of a box's length beside the box are its drone's, too.
 _MARGIN = 0.2
 
@@ -47,7 +51,7 @@ class NetworkBackground(OwnBackground):
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
         return {
-            "network": 4,
+            "network": 6,
             "finding": FINDING_VERSION,
             "model": digest_file(self.model),
             **Living(self.settings).key,
@@ -66,8 +70,16 @@ class NetworkBackground(OwnBackground):
             if differs is None:
                 yield None
                 continue
-            share, boxes, _ = findings(network, image, background)
-            yield remove_speckle(_foreground(share, differs, boxes), least_px)
+            share, boxes, confidence = findings(network, image, background, _SEEN)
+            needed = np.where(_seen_share(differs, boxes) > _SEEN_SHARE, _SEEN, _UNSEEN)
+            yield remove_speckle(_foreground(share, differs, boxes[confidence >= needed]), least_px)
+
+
+def _seen_share(differs: _Mask, boxes: Float[np.ndarray, "found 4"]) -> Float[np.ndarray, "found"]:
+    """The share of the pixels of each box, xyxy, that are foreground by "living"."""
+    ends = np.clip(np.round(boxes), 0, np.tile(differs.shape[::-1], 2)).astype(int)
+    parts = [differs[y0:y1, x0:x1] >= 128 for x0, y0, x1, y1 in ends]
+    return np.array([part.mean() if part.size else 0.0 for part in parts])
 
 
 def _foreground(
