@@ -2,8 +2,7 @@
 
 "living" tells contours sharply, but is blind for parts that look like the background and for drones that it has learned
 as background, and knows people and leaves as foreground. In and near each box that the network finds, the foreground is
-what either of both tells; elsewhere there is none. A box in which "living" sees something has two witnesses, and needs
-less confidence.
+what either of both tells; elsewhere there is none. A box in which "living" sees something too needs less confidence.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ from psotrack.support import digest_file
 #: Pixels count whose probability is at least this share. Those of a smaller one are a rim about the drone, which made
 #: errors larger on simulated flights.
 _LEAST_SHARE = 0.5
-#: Least confidence of a box in which "living" sees more than a share of the pixels, that share, and least confidence of
-#: other boxes. Chosen on the clips and flights of `experiments/accuracy/foreground.py`.
-_SEEN, _SEEN_SHARE, _UNSEEN = 0.2, 0.02, USUAL_CONFIDENCE
+#: Least confidence of a box in which "living" sees more than this share of the pixels; of other boxes it is the usual
+#: one. Both were chosen on the clips and flights of `experiments/accuracy/foreground.py`.
+_SEEN_CONFIDENCE, _SEEN_SHARE = 0.2, 0.02
 #: Pixels this share of a box's length beside the box are its drone's, too.
 _MARGIN = 0.2
 
@@ -70,16 +69,17 @@ class NetworkBackground(OwnBackground):
             if differs is None:
                 yield None
                 continue
-            share, boxes, confidence = findings(network, image, background, _SEEN)
-            needed = np.where(_seen_share(differs, boxes) > _SEEN_SHARE, _SEEN, _UNSEEN)
-            yield remove_speckle(_foreground(share, differs, boxes[confidence >= needed]), least_px)
+            share, boxes, confidence = findings(network, image, background, _SEEN_CONFIDENCE)
+            seen_too = [
+                (differs[part] >= 128).sum() > _SEEN_SHARE * differs[part].size for part in _parts(boxes)
+            ]
+            counts = (confidence >= USUAL_CONFIDENCE) | np.array(seen_too, bool)
+            yield remove_speckle(_foreground(share, differs, boxes[counts]), least_px)
 
 
-def _seen_share(differs: _Mask, boxes: Float[np.ndarray, "found 4"]) -> Float[np.ndarray, "found"]:
-    """The share of the pixels of each box, xyxy, that are foreground by "living"."""
-    ends = np.clip(np.round(boxes), 0, np.tile(differs.shape[::-1], 2)).astype(int)
-    parts = [differs[y0:y1, x0:x1] >= 128 for x0, y0, x1, y1 in ends]
-    return np.array([part.mean() if part.size else 0.0 for part in parts])
+def _parts(boxes: Float[np.ndarray, "found 4"]) -> list[tuple[slice, slice]]:
+    """The pixels of boxes, xyxy, as indices of an image."""
+    return [np.s_[y0:y1, x0:x1] for x0, y0, x1, y1 in np.maximum(np.round(boxes), 0).astype(int)]
 
 
 def _foreground(
@@ -95,7 +95,6 @@ def _foreground(
     margin = np.tile(_MARGIN * (boxes[:, 2:] - boxes[:, :2]) + 1, 2) * [-1, -1, 1, 1]
     told = np.where(share >= _LEAST_SHARE, np.round(255 * share), 0).astype(np.uint8)
     either, kept = np.maximum(differs, told), np.zeros_like(differs)
-    for x0, y0, x1, y1 in np.maximum(np.round(boxes + margin), 0).astype(int):
-        near = np.s_[y0:y1, x0:x1]
+    for near in _parts(boxes + margin):
         kept[near] = either[near]
     return kept
